@@ -63,7 +63,7 @@ def tried(text, window):
     if sequence.truth is None:
         raise SystemExit(f"{spec}: no exact truth; expected a simulated recording")
     recording = Recording(sequence, resolve(None), window, [int(key)], looks_around=True)
-    stretch = recording.around(int(key))
+    stretch = recording.searched(int(key))
     heights, num = ground(stretch), len(stretch.sweeps)
     parts = {(0, num), (num // 4, num - num // 4), (0, max(3, num // 5)), (num - 3, num)}
     found = [

@@ -10,7 +10,7 @@ import pytest
 
 from densify.flow.tracking.candidates import Batch, Obstacles, Strips, find_candidates
 from densify.free_space.ground import ABOVE_GROUND_M, ground
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.types import RegisteredSweep, Stretch

@@ -43,7 +43,7 @@ def vote_twin(record, pixel, depth_m, surely):
     height, width = SMALL
     v, u = divmod(pixel, width)
     gap, least, doubt = record.gap_px[v, u], 1.0, votes._DOUBT if surely else 0.0
-    aside = round(votes._ASIDE * gap) if surely else 0
+    aside = round(votes._SHIFT * gap) if surely else 0
 
     def colour(row, column):
         row, column = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
@@ -65,7 +65,7 @@ def vote_twin(record, pixel, depth_m, surely):
                     known = 1 / record.depth_m[v + dv, u + du]
                     predicted = known - record.tilt[v + dv, u + du] @ (du, dv)
                     predicted = min(max(predicted, known / 1.4), 1.4 * known)
-                    weight = np.exp(-change / (2 * votes._COLOURS**2)) + votes._THROUGH
+                    weight = np.exp(-change / (2 * votes._COLOURS**2)) + votes._ACROSS_EDGE
                     weight /= 1 + step / (votes._DECAY * gap)
                     same_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
                     all_votes += weight

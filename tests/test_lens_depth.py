@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from densify.depth.exposure import Exposure
-from densify.geometry.cameras import converted, rays
+from densify.geometry.cameras import convert_depth, rays
 from densify.geometry.types import Camera, Patches, Reason
 from tests.depth_scenes import depth_map, make_camera, make_cloud
 
@@ -80,9 +80,9 @@ def test_depth_turns_from_one_measure_into_the_other():
         ray = rays(camera, pixels(camera)).reshape(camera.height_px, camera.width_px, 3)
         known = np.isfinite(ray[..., 2]) & (ray[..., 2] > 0)
         range_m = np.where(np.isfinite(ray[..., 2]), 7.0, 0).astype(np.float32)
-        z = converted(camera, range_m, "range", "z")
+        z = convert_depth(camera, range_m, "range", "z")
         np.testing.assert_allclose(z[known], 7 * ray[known][:, 2], rtol=1e-6)
         assert not z[~known].any()
-        back = converted(camera, z, "z", "range")
+        back = convert_depth(camera, z, "z", "range")
         np.testing.assert_allclose(back[known], 7.0, rtol=1e-5)
-        assert converted(camera, z, "z", "z") is z
+        assert convert_depth(camera, z, "z", "z") is z

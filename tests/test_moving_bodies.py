@@ -100,8 +100,8 @@ def test_nothing_shines_through_a_closed_box():
         return within(y, z, PANE) & (pane.random(len(y)) < 0.4)
 
     before, after, true_m, y, z = maps(lambda y, z: within(y, z, DOOR), passes)
-    box, beside = true_m > 0, stage._well_inside(true_m == 0, 4)
-    assert not ((after.filled_m > 1.2 * true_m) & stage._well_inside(box, 2)).any()
+    box, beside = true_m > 0, stage._erode(true_m == 0, 4)
+    assert not ((after.filled_m > 1.2 * true_m) & stage._erode(box, 2)).any()
     known = box & (after.filled_m > 0)
     assert known.sum() > 0.95 * box.sum() and (before.filled_m > 0)[box].mean() < 0.5
     assert np.abs(after.filled_m / np.where(box, true_m, 1) - 1)[known].max() < 0.05
@@ -109,7 +109,7 @@ def test_nothing_shines_through_a_closed_box():
     same = after.filled_m[beside] == before.filled_m[beside]
     assert same.mean() > 0.999
     measured = box & (after.depth_m > 0)
-    assert not (measured & stage._well_inside(within(y, z, DOOR), 3)).any()  # filled, not measured
+    assert not (measured & stage._erode(within(y, z, DOOR), 3)).any()  # filled, not measured
     assert (after.frame[measured] >= 0).all()
 
 
@@ -118,9 +118,9 @@ def test_an_open_frame_stays_open():
         lambda y, z: np.zeros(len(y), bool), lambda y, z: within(y, z, HOLE)
     )
     hole, frame = within(y, z, HOLE), (true_m > 0) & ~within(y, z, HOLE)
-    open_m = after.filled_m[stage._well_inside(hole, 9)]
+    open_m = after.filled_m[stage._erode(hole, 9)]
     assert (np.abs(open_m - WALL_M) < 0.5).mean() > 0.95
-    shown = after.filled_m[stage._well_inside(frame, 3)]
+    shown = after.filled_m[stage._erode(frame, 3)]
     assert (np.abs(shown / 10 - 1) < 0.2).mean() > 0.95
 
 
@@ -150,8 +150,8 @@ def test_a_smooth_offset_is_the_least_of_its_sum():
     def cost(o):
         across = (np.diff(o, axis=1)[inside[:, 1:] & inside[:, :-1]] ** 2).sum()
         down = (np.diff(o, axis=0)[inside[1:] & inside[:-1]] ** 2).sum()
-        small = stage._HELD * (o[inside] ** 2).sum()
-        return ((o - offset)[known] ** 2).sum() + stage._STIFF * (across + down) + small
+        small = stage._TOWARDS_HULL * (o[inside] ** 2).sum()
+        return ((o - offset)[known] ** 2).sum() + stage._SMOOTHNESS * (across + down) + small
 
     smooth = stage._smooth(offset, known, inside)
     for _ in range(50):

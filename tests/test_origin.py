@@ -10,7 +10,7 @@ import pytest
 
 from densify.flow.tracking.candidates import find_candidates
 from densify.free_space.ground import ground
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry.types import Stretch
 from tests.dataset_scenes import COARSE
 from tests.found_motion import motion_in

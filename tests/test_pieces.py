@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from densify.flow.tracking.groups import join_pieces
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry import poses
 from tests.found_motion import Found
 from tests.scenes import car

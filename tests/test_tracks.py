@@ -21,7 +21,7 @@ from densify.flow.tracking.likelihood import (
 from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
 from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.ground import ground
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry.clock import Clock
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 

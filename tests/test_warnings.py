@@ -12,7 +12,7 @@ import yaml
 import densify
 from densify.config import resolve
 from densify.depth.confidence import expected_outliers
-from densify.free_space.raw_sweeps import without_lone
+from densify.free_space.raw_sweeps import remove_lone_returns
 from densify.geometry import poses
 from densify.outputs.key_outputs import write_result
 from densify.pipeline.recording import Recording
@@ -159,7 +159,7 @@ def test_snow_is_no_motion_and_is_told():
 def test_good_weather_is_left_as_it_is(place, test_data):
     sequence = densify.open_sequence(test_data / place)
     sweep = sequence[sequence.frames[0]]
-    assert without_lone(sweep) is sweep
+    assert remove_lone_returns(sweep) is sweep
 
 
 @pytest.mark.parametrize("drive", ["2011_09_26_drive_0002_sync", "2011_09_26_drive_0013_sync"])

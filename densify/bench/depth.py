@@ -21,7 +21,7 @@ from densify.config import Config
 from densify.config.errors import InputError
 from densify.depth.exposure import Exposure, Shot, key_shots
 from densify.geometry import poses
-from densify.geometry.cameras import converted, depth_along, rays
+from densify.geometry.cameras import convert_depth, depth_along, rays
 from densify.geometry.types import (
     Bool,
     Camera,
@@ -152,7 +152,7 @@ def exact_truth(
         known_m[v[below], u[below]] = depth_m[v[below], u[below]]
         moving = sequence.truth.moving_mask(camera.name, number)
         measure = config.project.depth if config.project.depth != "auto" else camera.measure
-        known_m = converted(camera, known_m, camera.measure, measure)
+        known_m = convert_depth(camera, known_m, camera.measure, measure)
         maps[name] = TruthMap(known_m, moving, by_disparity=True)
     return maps
 

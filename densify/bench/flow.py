@@ -183,7 +183,7 @@ class Scorer:
             labels = {f: labelled_flow(folder, sequence.name, stretch, f) for f in sources}
         elif truths is not None:
             labels = {f: truths[f].as_label() for f in sources}
-        return Scorer(stretch, key, recording.around(key), above, sources, truths, labels)
+        return Scorer(stretch, key, recording.searched(key), above, sources, truths, labels)
 
     def pooled_challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
         """Return `challenge_scores` of frame -> flow towards the key; None without truth."""

@@ -327,8 +327,8 @@ class Subject(NamedTuple):
         sequence, settings = recording.sequence, recording.settings
         shots = key_shots(sequence, choose_cameras(sequence, [camera]), key, settings.project)
         images, cloud = load_images(sequence, shots), recording.moment(key, True, "").cloud
-        beyond = recording.find_beyond(key)
-        scene = scene_of(recording, key, shots, images, beyond, cloud, False, Watch())
+        far_surfaces = recording.find_far_surfaces(key)
+        scene = scene_of(recording, key, shots, images, far_surfaces, cloud, False, Watch())
         seen = see(scene, "flow", cloud)
         if truth is None:
             held_out = HeldOut.of(scene.views, cloud).judged_maps(seen, METHODS["flow"].visible)

@@ -41,10 +41,11 @@ WEIGHTS: Mapping[str, float] = {
     "rejected pixel": 1.30,
 }
 """Weight of each feature, see `features`."""
-_LEAST_VOTES, _LEAST_SHARE, _LEAST_STEP = 0.001, 0.005, 0.03  # smaller values are not told apart
-_AGE_S, _LEAST_COVER = 0.03, 0.05  # smaller values are not told apart either
-_NUM_STEPS = 20  # number of intervals of confidence
-_UNCONFIRMED = 2.7  # found / expected outliers of one sweep alone: 0.9 to 6, on six recordings
+# Scales of the features' logarithms: values below them are all close to 0
+_LEAST_VOTES, _LEAST_SHARE, _LEAST_STEP, _LEAST_AGE_S, _LEAST_COVER = 0.001, 0.005, 0.03, 0.03, 0.05
+_NUM_INTERVALS = 20  # number of intervals of confidence
+# True outliers of one sweep alone / those expected: 0.9 to 6, on six recordings
+_UNCONFIRMED = 2.7
 
 
 def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
@@ -67,15 +68,16 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     measured = record.depth_m > 0
     gap_px = float(np.median(record.gap_px))
 
+    # Of the nearest measured pixel
     nearest = nearest_pixel(measured)
     age_s = np.abs(since_key_ns[record.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
     edge = np.where(measured, record.edge, 0)[nearest]
     edge[record.on_body] = ALL_ROUND
 
+    # Of the pixels around, without those outside the image
     step = _log_step(depth_m, record.filled_m, _window_px(1, gap_px)) / tolerance(depth_m, camera)
     cover_px = _window_px(2, gap_px)
-    within_image = np.ones_like(shown)
-    cover = _mean(shown, cover_px) / _mean(within_image, cover_px)
+    cover = _mean(shown, cover_px) / _mean(np.ones_like(shown), cover_px)
     columns = [
         np.ones(shown.shape),
         ~measured,
@@ -83,7 +85,7 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
         _log_rejected_share(record, _window_px(2, gap_px)),
         _log_rejected_share(record, _window_px(8, gap_px)),
         _logarithm(step, _LEAST_STEP),
-        _logarithm(age_s, _AGE_S),
+        _logarithm(age_s, _LEAST_AGE_S),
         -np.log2(np.maximum(cover, _LEAST_COVER)),
         np.clip(ALL_ROUND - edge, 0, ALL_ROUND - 1),
         rejected,
@@ -105,7 +107,7 @@ def tolerance(depth_m: Float32, camera: Camera) -> Float:
 
 
 def _logarithm(values: Float | Float32, least: float) -> Float:
-    """Return the logarithms to base 10 of values from 0; values below ``least`` are close to 0."""
+    """Return log10(1 + values / least): values from 0, those below ``least`` are close to 0."""
     logarithm: Float = np.log10(values / least + 1)
     return logarithm
 
@@ -122,7 +124,7 @@ def _mean(mask: Bool, size_px: int) -> Float32:
 
 
 def _log_rejected_share(record: MapRecord, size_px: int) -> Float:
-    """Return the (H,W) logarithm of the share of boundary pixels around that are not accepted."""
+    """Return the (H,W) logarithm of the share of the pixels with a return that are rejected."""
     measured = record.depth_m > 0
     rejected = (record.boundary_m > 0) & ~measured
     share = _mean(rejected, size_px) / np.maximum(_mean(rejected | measured, size_px), 1e-4)
@@ -130,12 +132,17 @@ def _log_rejected_share(record: MapRecord, size_px: int) -> Float:
 
 
 def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
-    """Return (H,W) the log ratio of the greatest filled depth around to the least, or rejected."""
+    """Return (H,W) the log ratio of the greatest depth in the window to the least, 0 without one.
+
+    Depths are those of the filled pixels around (``filled_m``) and the pixel's own (``depth_m``),
+    which may be rejected.
+    """
     own_m = np.where(depth_m > 0, depth_m, np.inf)
-    near_m = np.minimum(np.where(filled_m > 0, filled_m, np.inf), own_m).astype(np.float32)
-    nearest_m = np.minimum(ndimage.minimum_filter(near_m, size_px), near_m)
-    far_m = np.maximum(depth_m, filled_m)
-    farthest_m = np.maximum(ndimage.maximum_filter(filled_m, size_px), far_m)
+    least_m = np.minimum(np.where(filled_m > 0, filled_m, np.inf), own_m).astype(np.float32)
+    nearest_m = np.minimum(ndimage.minimum_filter(least_m, size_px), least_m)
+    farthest_m = np.maximum(
+        ndimage.maximum_filter(filled_m, size_px), np.maximum(depth_m, filled_m)
+    )
     step = np.zeros_like(depth_m)
     np.log(farthest_m / nearest_m, out=step, where=depth_m > 0)
     return step
@@ -190,26 +197,25 @@ def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthM
     rejected = depth_map.rejected
     if rejected is None or max_outliers is None:
         return replace(depth_map, rejected=None)
+    # The (H,W) pixels that stay, and those that are restored from the rejected ones
     shown = depth_map.filled_m > 0
     confidence = depth_map.confidence[shown]
-    keep = shown.copy()
-    give_back = rejected.depth_m > 0
+    stays = shown.copy()
+    restored = rejected.depth_m > 0
     if shown.any() and outlier_probability(confidence).mean() > max_outliers:
-        keep[shown] = choose_most_certain(confidence, max_outliers)
-        give_back[:] = False
+        stays[shown] = choose_most_certain(confidence, max_outliers)
+        restored[:] = False
     else:
-        give_back[give_back] = choose_most_certain(
-            rejected.confidence[give_back], max_outliers, confidence
+        restored[restored] = choose_most_certain(
+            rejected.confidence[restored], max_outliers, confidence
         )
-    give_back_measured = give_back & (rejected.frame >= 0)
+    is_measured = restored & (rejected.frame >= 0)
     return replace(
         depth_map,
-        depth_m=np.select([give_back_measured, keep], [rejected.depth_m, depth_map.depth_m]),
-        filled_m=np.select([give_back, keep], [rejected.depth_m, depth_map.filled_m]),
-        confidence=np.select([give_back, keep], [rejected.confidence, depth_map.confidence]),
-        frame=np.select(
-            [give_back_measured, keep], [rejected.frame, depth_map.frame], np.int32(-1)
-        ),
+        depth_m=np.select([is_measured, stays], [rejected.depth_m, depth_map.depth_m]),
+        filled_m=np.select([restored, stays], [rejected.depth_m, depth_map.filled_m]),
+        confidence=np.select([restored, stays], [rejected.confidence, depth_map.confidence]),
+        frame=np.select([is_measured, stays], [rejected.frame, depth_map.frame], np.int32(-1)),
         evidence=None,
         rejected=None,
     )
@@ -286,16 +292,16 @@ def reliability(depth_map: DepthMap, truth_m: Float32, camera: Camera) -> list[d
     confidence = depth_map.confidence[compared]
     is_outlier = is_outlier_depth(depth_map.filled_m[compared], truth_m[compared], camera.focal_px)
     # A confidence of 1 belongs to the last interval.
-    interval = np.minimum((confidence * _NUM_STEPS).astype(np.int64), _NUM_STEPS - 1)
-    num = np.bincount(interval, minlength=_NUM_STEPS)
-    expected = np.bincount(interval, outlier_probability(confidence), _NUM_STEPS)
-    num_outliers = np.bincount(interval, is_outlier, _NUM_STEPS)
+    interval = np.minimum((confidence * _NUM_INTERVALS).astype(np.int64), _NUM_INTERVALS - 1)
+    num_pixels = np.bincount(interval, minlength=_NUM_INTERVALS)
+    num_expected = np.bincount(interval, outlier_probability(confidence), _NUM_INTERVALS)
+    num_outliers = np.bincount(interval, is_outlier, _NUM_INTERVALS)
     return [
         {
-            "confidence": i / _NUM_STEPS,
-            "num_compared": int(num[i]),
-            "expected": float(expected[i] / num[i]),
-            "outliers": float(num_outliers[i] / num[i]),
+            "confidence": i / _NUM_INTERVALS,
+            "num_compared": int(num_pixels[i]),
+            "expected": float(num_expected[i] / num_pixels[i]),
+            "outliers": float(num_outliers[i] / num_pixels[i]),
         }
-        for i in np.flatnonzero(num).tolist()
+        for i in np.flatnonzero(num_pixels).tolist()
     ]

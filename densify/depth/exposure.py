@@ -7,7 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,10 @@ from densify.geometry.types import (
 
 _log = logging.getLogger("densify")
 _USUAL = ProjectSettings()
-_JITTER = 1.5  # greatest ratio of a used half period to half the shorter neighbouring period
-_NUM_ROW_STEPS = 4  # number of steps of the search for the row that observes a point
+# Greatest period to a neighbouring sweep that bounds a sweep's own time, as a multiple of the
+# shorter one of the two: sweeps jitter, gaps are longer
+_JITTER = 1.5
+_NUM_ROW_STEPS = 4  # number of iterations of the search for the row that observes a point
 _SAME_AGE_NS = 10_000_000  # ages of two sweeps that differ by less are equal, for clock jitter
 AT_ONCE = 1 << 16
 """Number of points that are projected together: their columns fit into the cache of a core."""
@@ -86,12 +88,12 @@ def key_shots(
                     (end_ns - begin_ns) / 2e6,  # half of the interval, in ms
                 )
         elif images_ns:
-            number = min(
+            nearest = min(
                 images_ns,
                 key=lambda number: (abs(images_ns[number] - stamp_ns), images_ns[number]),
             )
-            shown_ns = images_ns[number] if settings.at == "camera" else stamp_ns
-            shots[camera.name] = Shot(camera, number, shown_ns)
+            shown_ns = images_ns[nearest] if settings.at == "camera" else stamp_ns
+            shots[camera.name] = Shot(camera, nearest, shown_ns)
         else:
             shots[camera.name] = Shot(camera, None, stamp_ns)
     return shots
@@ -110,7 +112,11 @@ def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str,
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
-    """Return start and end (ns) of the time nearer to the key sweep than to any other sweep."""
+    """Return start and end (ns) of the time nearer to the key sweep than to any other sweep.
+
+    Towards a gap or an end of the recording it is at most 1.5 times as long as on the other side.
+    It is not limited if neither neighbour has a stamp.
+    """
     frames = list(sequence.frames)
     index = frames.index(key)
     stamps_ns = {}
@@ -125,11 +131,11 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
     key_ns = stamps_ns[key]
-    stamps = list(stamps_ns.values())
+    ascending_ns = list(stamps_ns.values())
     # A gap in the recording, or the end of it, must not widen the time.
-    max_period_ns = int(_JITTER * np.diff(stamps).min())
-    before_ns = max([key_ns - max_period_ns, *(stamp for stamp in stamps if stamp < key_ns)])
-    after_ns = min([key_ns + max_period_ns, *(stamp for stamp in stamps if stamp > key_ns)])
+    max_period_ns = int(_JITTER * np.diff(ascending_ns).min())
+    before_ns = max([key_ns - max_period_ns, *(t_ns for t_ns in ascending_ns if t_ns < key_ns)])
+    after_ns = min([key_ns + max_period_ns, *(t_ns for t_ns in ascending_ns if t_ns > key_ns)])
     return (before_ns + key_ns) // 2, (key_ns + after_ns) // 2
 
 
@@ -148,7 +154,7 @@ class InView(NamedTuple):
     uv: Float  # (K,2) pixel coordinates as in `Sight`
 
     def joined(self, appended: InView, num: int) -> InView:
-        """Return the points with those of another cloud; this cloud has ``num`` points in all."""
+        """Return the points with those of a cloud appended to this one of ``num`` points."""
         return InView(
             self.exposure,
             np.concatenate([self.rows, num + appended.rows]),
@@ -221,18 +227,20 @@ class Exposure:
         if not self.camera.is_rolling:
             return Sight(points_cam, uv, inside & (self.depth_m(points_cam) > NEAREST_M))
 
-        # The row that observes a point depends on the row's time, and so it is found step by step.
+        # The row that observes a point depends on its position at that row's exposure time, which
+        # depends on the row. Both are found by iteration.
         exposed_cam = points_cam
         last_pixel = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
         pixel_time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
+        velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
         for _ in range(_NUM_ROW_STEPS):
             pixel = np.where(np.isnan(uv), last_pixel / 2, np.clip(uv, 0, last_pixel))
             # The middle row is exposed at the time that the map shows.
             row_s = ((pixel - last_pixel / 2) * pixel_time_s).sum(axis=1, keepdims=True)
-            velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
-            turn = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
-            ahead = points_cam + row_s * (velocity_cam - self.twist[3:])
-            exposed_cam = poses.transform_each(turn, ahead)
+            # The camera moves by its twist, so the points move by its inverse in the camera frame.
+            rotation = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
+            translated = points_cam + row_s * (velocity_cam - self.twist[3:])
+            exposed_cam = poses.transform_each(rotation, translated)
             uv, inside = image_points(self.camera, exposed_cam)
         return Sight(exposed_cam, uv, inside & (self.depth_m(exposed_cam) > NEAREST_M))
 
@@ -296,9 +304,10 @@ def _exposure(
     registered = stretch[frame]
     since_sweep_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
     twist = registered.twist_before if since_sweep_s < 0 else registered.twist_after
+    # From the lidar at the sweep's reference time to the camera at the shot's time
     T_cam_lidar = camera.T_cam_lidar @ poses.inverse(poses.exp(since_sweep_s * twist))
-    at_image = settings.project.at == "camera" and shot.number is not None
-    if at_image and hasattr(sequence, "T_world_cam"):
+    at_exposure = settings.project.at == "camera" and shot.number is not None
+    if at_exposure and hasattr(sequence, "T_world_cam"):
         T_cam_world = poses.inverse(sequence.T_world_cam(camera.name, shot.number or 0))
         T_cam_lidar = T_cam_world @ sequence.T_world_lidar(frame)
     measure = settings.project.depth
@@ -306,7 +315,7 @@ def _exposure(
         camera=camera,
         T_cam_key=T_cam_lidar @ stretch.T_target_source(frame, key),
         late_s=float(shot.stamp_ns - stretch[key].sweep.stamp_ns) * 1e-9,
-        twist=poses.carried(camera.T_cam_lidar, twist),
+        twist=poses.transform_twist(camera.T_cam_lidar, twist),
         number=shot.number,
         measure=camera.measure if measure == "auto" else measure,
     )
@@ -335,19 +344,14 @@ class PointsInImage(NamedTuple):
     age_ns: Int  # (K,) time between the source sweep and the key sweep, see `_ages_ns`
     far: Bool  # (K,) True for points of sweeps beyond the window
 
-    def take(self, rows: Int) -> PointsInImage:
-        """Return the points at these indices, in their order."""
-        columns: Any = (column.take(rows, axis=0) for column in self)
-        return PointsInImage(*columns)
-
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:
     """Return the points of the cloud in the view, with the patches' size and slope in pixels."""
     # In the order of the image's rows, points that are used together lie together in memory.
-    by_image_row = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
+    order = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
     exposure = view.exposure
-    rows = view.rows[by_image_row]
-    points_cam = view.points_cam.take(by_image_row, axis=0)
+    rows = view.rows[order]
+    points_cam = view.points_cam.take(order, axis=0)
     depth = exposure.depth_m(points_cam).astype(np.float32)
     normal = poses.rotate(exposure.T_cam_key, patches.normal.take(rows, axis=0).astype(np.float64))
     is_pinhole = exposure.camera.is_rectified and exposure.measure == "z"
@@ -357,7 +361,7 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
     frame, far = cloud.frame[rows], cloud.far[rows]
     return PointsInImage(
         rows=rows,
-        uv=view.uv.take(by_image_row, axis=0),
+        uv=view.uv.take(order, axis=0),
         depth=depth,
         inverse=1 / depth.astype(np.float64),
         focal_px=scale.focal_px,
@@ -372,7 +376,7 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
 def _pinhole_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> _Scale:
-    """Return the scale of points for z depth in a rectified image."""
+    """Return the scale of points (K,3), normals (K,3) and spacings (K,2): a rectified image, z."""
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     distance = np.einsum("ij,ij->i", normal, points_cam)  # d
@@ -386,7 +390,7 @@ def _pinhole_scale(
 def _lens_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> _Scale:
-    """Return the scale of points for any lens and measure."""
+    """Return the scale of points for any lens and measure; arguments as `_pinhole_scale`."""
     # If a point moves on the plane n · p = d until the image moves by one pixel, p moves by
     # δ = J⁺ - p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
     J = pixels_per_metre(exposure.camera, points_cam)
@@ -417,7 +421,11 @@ def _lens_scale(
 
 
 def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
-    """Return (K,) ns from the points' sweeps to the key; in the window within 10 ms are equal."""
+    """Return (K,) ns between the points' sweeps and the key sweep.
+
+    Ages of two sweeps of the window that differ by less than 10 ms are made equal. Else clock
+    jitter would decide between a sweep before the key sweep and one after it.
+    """
     ages_ns = np.abs(since_key_ns)
     in_window = np.flatnonzero(~far)
     window_frame = frame[in_window]
@@ -429,7 +437,6 @@ def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
     sweep_ages_ns[window_frame - first] = ages_ns[in_window]
 
     for younger, older in pairwise(np.argsort(sweep_ages_ns, kind="stable")):
-        # Else clock jitter would decide between the sweeps before and after the key sweep.
         if sweep_ages_ns[older] - sweep_ages_ns[younger] < _SAME_AGE_NS:
             sweep_ages_ns[older] = sweep_ages_ns[younger]
     ages_ns[in_window] = sweep_ages_ns[window_frame - first]

@@ -13,8 +13,7 @@ import numpy as np
 from densify.depth.confidence import confidence_by_age
 from densify.depth.exposure import AT_ONCE, Exposure
 from densify.depth.patches import AGREE_M, HIDDEN_FRACTION, fit_tangents
-from densify.free_space.range_image import RangeImage
-from densify.free_space.seen_through import FREE_MARGIN
+from densify.free_space.range_image import FREE_MARGIN, RangeImage
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
@@ -28,7 +27,7 @@ from densify.geometry.types import (
     Int,
     Patches,
     RegisteredSweep,
-    StandingWorld,
+    StaticWorld,
     Stretch,
     Sweep,
 )
@@ -38,11 +37,11 @@ _MOST_RANGE_M = 60.0  # greatest range of returns that are registered well
 _MOST_SPACING_M = 0.5 * AGREE_M
 _SLACK_M = 0.5  # distance from its pose at which a camera may be, in the fast test of the view
 _PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
-_FEW_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
-_WITNESSES_M = 5.0  # travel between testing sweeps
-# Travel from the tested sweep to its testing sweep: most of a car, at the ends of the road its rear
-# half
-_WITNESS_M, _LEAST_WITNESS_M = 3.5, 2.0
+_MIN_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
+_TESTER_STEP_M = 5.0  # travel between testing sweeps
+# Travel from a sweep to the testing sweep of its points, and the least at the ends of the road. A
+# car ahead that drives along has then left most of its place, or its rear half.
+_TEST_M, _LEAST_TEST_M = 3.5, 2.0
 
 
 def in_reach(sweep: Sweep) -> Bool:
@@ -68,30 +67,30 @@ def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> lis
         range_images = pool.map(RangeImage.of, [sweeps[tester] for tester in testers])
         images = dict(zip(testers, range_images, strict=True))
 
-    def seen_through(index: int) -> Bool:
+    def find_in_sweep(index: int) -> Bool:
         """Return (N,) True for the points of a sweep that were seen through."""
         tested = sweeps[index]
         points = tested.sweep.points
-        witnesses = _choose_witnesses(index, testers, travel_m)
-        # From the tested sweep's lidar frame to the frames of the witnesses
-        T_witness = [
-            poses.inverse(sweeps[witness].T_world_lidar) @ tested.T_world_lidar
-            for witness in witnesses
+        own_testers = _choose_testers_of(index, testers, travel_m)
+        T_tester_lidar = [
+            poses.inverse(sweeps[tester].T_world_lidar) @ tested.T_world_lidar
+            for tester in own_testers
         ]
-        witness_of = np.zeros(len(points), np.int64)
-        if len(witnesses) == 2:  # points ahead belong to the later witness
-            to_later_witness = poses.inverse(T_witness[1])[:3, 3]
-            witness_of[points @ to_later_witness > 0] = 1
+        # Points on the side of the later tester belong to it, the others to the first.
+        tester_of_point = np.zeros(len(points), np.int64)
+        if len(own_testers) == 2:
+            to_later_tester = poses.inverse(T_tester_lidar[1])[:3, 3]
+            tester_of_point[points @ to_later_tester > 0] = 1
 
-        free = np.zeros(len(points), bool)
-        for number, witness in enumerate(witnesses):
-            rows = np.flatnonzero(witness_of == number)
-            points_witness = poses.transform(T_witness[number], points.take(rows, axis=0))
-            free[rows] = images[witness].sees_through(points_witness, *FREE_MARGIN, _FEW_FILLED)
-        return free
+        is_free = np.zeros(len(points), bool)
+        for number, tester in enumerate(own_testers):
+            rows = np.flatnonzero(tester_of_point == number)
+            points_tester = poses.transform(T_tester_lidar[number], points.take(rows, axis=0))
+            is_free[rows] = images[tester].sees_through(points_tester, *FREE_MARGIN, _MIN_FILLED)
+        return is_free
 
     with ThreadPoolExecutor(num_threads()) as pool:
-        return list(pool.map(seen_through, range(len(sweeps))))
+        return list(pool.map(find_in_sweep, range(len(sweeps))))
 
 
 def _choose_testers(travel_m: Float) -> list[int]:
@@ -100,33 +99,31 @@ def _choose_testers(travel_m: Float) -> list[int]:
         return []
     testers = [0]
     last = len(travel_m) - 1
-    for index, at_m in enumerate(travel_m.tolist()):
-        if at_m - travel_m[testers[-1]] >= _WITNESSES_M or index == last > 0:
+    for index, sweep_m in enumerate(travel_m.tolist()):
+        if sweep_m - travel_m[testers[-1]] >= _TESTER_STEP_M or index == last > 0:
             testers.append(index)
     return testers
 
 
-def _choose_witnesses(index: int, testers: Sequence[int], travel_m: Float) -> list[int]:
-    """Return the sweeps (indices) before and after a sweep that test it: two, one or none."""
+def _choose_testers_of(index: int, testers: Sequence[int], travel_m: Float) -> list[int]:
+    """Return the testing sweeps (indices) of one sweep, on either side: two, one or none."""
     ahead_m = np.array([travel_m[tester] - travel_m[index] for tester in testers])
-    witnesses = []
+    chosen = []
     for distance_m in (-ahead_m, ahead_m):
-        far_enough = np.flatnonzero(distance_m >= _WITNESS_M)
+        far_enough = np.flatnonzero(distance_m >= _TEST_M)
         if len(far_enough):
-            witnesses.append(testers[far_enough[np.argmin(distance_m[far_enough])]])
-        elif distance_m.max() >= _LEAST_WITNESS_M:
-            witnesses.append(testers[int(np.argmax(distance_m))])
-    return witnesses
+            chosen.append(testers[far_enough[np.argmin(distance_m[far_enough])]])
+        elif distance_m.max() >= _LEAST_TEST_M:
+            chosen.append(testers[int(np.argmax(distance_m))])
+    return chosen
 
 
-def static_points(
-    sensors: Sensors, registered: RegisteredSweep, seen_through: Bool
-) -> StandingWorld:
+def static_points(sensors: Sensors, registered: RegisteredSweep, seen_through: Bool) -> StaticWorld:
     """Return the points of a sweep not ``seen_through`` (N,), world frame, with their patches."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     source = np.zeros(len(sweep), np.int32)
     surface = fit_tangents(sweep.points, sweep.lidar, source, sensors, [sensors.origins_m])
-    return StandingWorld(
+    return StaticWorld(
         points=poses.transform(T_world_lidar, sweep.points).astype(np.float32),
         normal=poses.rotate(T_world_lidar, surface.normal.astype(np.float64)).astype(np.float32),
         spacing_m=np.minimum(surface.spacing_m, np.float32(_MOST_SPACING_M)),
@@ -139,22 +136,22 @@ def static_points(
     ).select(~seen_through)
 
 
-def join_worlds(worlds: Sequence[StandingWorld]) -> StandingWorld:
+def join_worlds(worlds: Sequence[StaticWorld]) -> StaticWorld:
     """Return the parts of one static world as a whole, ordered by frame number."""
-    # With the empty world there is something to concatenate.
-    worlds = [_EMPTY_WORLD, *sorted(worlds, key=lambda world: world.frames)]
-    # The sources of each world follow those of the worlds before it.
-    firsts = np.cumsum([0, *(len(world.frames) for world in worlds)])
-    sources = [world.source + np.int32(first) for world, first in zip(worlds, firsts, strict=False)]
-    names = {field.name for field in fields(StandingWorld)} - {"source", "frames", "left_out"}
+    # The empty world is there so that something can be concatenated.
+    parts = [_EMPTY_WORLD, *sorted(worlds, key=lambda world: world.frames)]
+    # ``source`` is an index in ``frames``: those of a part follow those of the parts before it.
+    firsts = np.cumsum([0, *(len(part.frames) for part in parts)])
+    sources = [part.source + np.int32(first) for part, first in zip(parts, firsts, strict=False)]
+    names = {field.name for field in fields(StaticWorld)} - {"source", "frames", "left_out"}
     columns: dict[str, Any] = {
-        name: np.concatenate([getattr(world, name) for world in worlds]) for name in names
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
     }
-    frames = tuple(frame for world in worlds for frame in world.frames)
-    return StandingWorld(**columns, source=np.concatenate(sources), frames=frames)
+    frames = tuple(frame for part in parts for frame in part.frames)
+    return StaticWorld(**columns, source=np.concatenate(sources), frames=frames)
 
 
-_EMPTY_WORLD = StandingWorld(
+_EMPTY_WORLD = StaticWorld(
     points=np.zeros((0, 3), np.float32),
     normal=np.zeros((0, 3), np.float32),
     spacing_m=np.zeros((0, 2), np.float32),
@@ -168,10 +165,9 @@ _EMPTY_WORLD = StandingWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) True for the points that a camera may observe.
+    """Return (N,) True for the points that a camera near its pose may observe: a fast test.
 
-    It is False only if the point is out of view from every position near the camera's pose. For a
-    lens that is no pinhole all are True.
+    False is certain, unlike True. For a lens that is no pinhole all are True.
 
     Args:
         camera: The camera.
@@ -197,12 +193,12 @@ def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float)
 
 
 def far_cloud(
-    world: StandingWorld,
+    world: StaticWorld,
     T_key_world: Float,
     stretch: Stretch,
     key: int,
     exposures: Mapping[str, Exposure],
-    standing_only: bool,
+    static_only: bool,
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
@@ -214,41 +210,44 @@ def far_cloud(
         stretch: Registered sweeps of the window.
         key: Frame number of the key sweep.
         exposures: Cameras and times of the maps, by name of the map.
-        standing_only: Leave out points that the first or the last sweep of the window saw through.
+        static_only: Leave out points that the first or the last sweep of the window saw through.
     """
     is_beyond = ~np.isin(world.frames, stretch.frames)
     rows = np.flatnonzero(is_beyond[world.source])
-    needed = np.zeros(len(world), bool)
+    is_needed = np.zeros(len(world), bool)
     for exposure in exposures.values():
-        needed[_select_needed(world.points, rows, T_key_world, exposure)] = True
-    world = world.select(needed)
-    points = poses.transform(T_key_world, world.points.astype(np.float64))
-    if standing_only:
+        is_needed[_select_needed(world.points, rows, T_key_world, exposure)] = True
+    used = world.select(is_needed)
+    points = poses.transform(T_key_world, used.points.astype(np.float64))
+    if static_only:
         is_static = ~_seen_through_by_ends(points, stretch, key)
-        world, points = world.select(is_static), points[is_static]
-    num = len(world)
-    since_key_ns = world.stamp_ns - stretch[key].sweep.stamp_ns  # of the sweeps
+        used, points = used.select(is_static), points[is_static]
+    num_points = len(used)
+    sweeps_since_key_ns = used.stamp_ns - stretch[key].sweep.stamp_ns
     cloud = Cloud(
         points=points,
         rigid_points=points,
-        frame=np.array(world.frames, np.int32)[world.source],
-        since_key_ns=since_key_ns[world.source],
-        row=world.row,
-        lidar=world.lidar,
-        moving=np.zeros(num, bool),
-        instance=np.full(num, -1, np.int32),
-        velocity_m_s=np.zeros((num, 3), np.float32),
-        confidence=confidence_by_age(since_key_ns)[world.source],
-        intensity=world.intensity,
-        rgb=np.zeros((num, 3), np.uint8),
-        far=np.ones(num, bool),
+        frame=np.array(used.frames, np.int32)[used.source],
+        since_key_ns=sweeps_since_key_ns[used.source],
+        row=used.row,
+        lidar=used.lidar,
+        moving=np.zeros(num_points, bool),
+        instance=np.full(num_points, -1, np.int32),
+        velocity_m_s=np.zeros((num_points, 3), np.float32),
+        confidence=confidence_by_age(sweeps_since_key_ns)[used.source],
+        intensity=used.intensity,
+        rgb=np.zeros((num_points, 3), np.uint8),
+        far=np.ones(num_points, bool),
     )
-    normal = poses.rotate(T_key_world, world.normal.astype(np.float64)).astype(np.float32)
-    return cloud, Patches(normal, world.spacing_m)
+    normal = poses.rotate(T_key_world, used.normal.astype(np.float64)).astype(np.float32)
+    return cloud, Patches(normal, used.spacing_m)
 
 
 def _select_needed(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:
-    """Return those of the ``rows`` (K,) of points (N,3), world frame, that a camera needs."""
+    """Return those of the ``rows`` (K,) of points (N,3), world frame, that a camera needs.
+
+    It needs one point in every pixel and step of depth.
+    """
     T_cam_world = exposure.T_cam_key @ T_key_world
     rows_in_view, cells = [rows[:0]], [np.zeros((0, 3), np.float32)]
     for first in range(0, len(rows), AT_ONCE):
@@ -260,20 +259,19 @@ def _select_needed(points: Float32, rows: Int, T_key_world: Float, exposure: Exp
         sight = exposure.see(points_key, np.zeros(points_key.shape, np.float32))
         inside = np.flatnonzero(sight.inside)
         depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
-        # A camera needs one point in every pixel and step of depth.
         cell = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / HIDDEN_FRACTION])
         rows_in_view.append(viewable[inside])
         cells.append(np.rint(cell.astype(np.float32)))
-    rows = np.concatenate(rows_in_view)
+    all_rows = np.concatenate(rows_in_view)
     # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
-    mixed_order = np.arange(len(rows)) * _PRIME % max(1, len(rows))
-    return rows[thinned(np.concatenate(cells), mixed_order, 1.0, 1)]
+    mixed_order = np.arange(len(all_rows)) * _PRIME % max(1, len(all_rows))
+    return all_rows[thinned(np.concatenate(cells), mixed_order, 1.0, 1)]
 
 
 def _seen_through_by_ends(points: Float, stretch: Stretch, key: int) -> Bool:
     """Return (M,) True for points, key frame, that the window's first or last sweep saw through."""
-    free = np.zeros(len(points), bool)
+    is_free = np.zeros(len(points), bool)
     for frame in {stretch.frames[0], stretch.frames[-1]} - {key}:
         points_sweep = poses.transform(stretch.T_target_source(frame, key), points)
-        free |= RangeImage.of(stretch[frame]).sees_through(points_sweep, *FREE_MARGIN)
-    return free
+        is_free |= RangeImage.of(stretch[frame]).sees_through(points_sweep, *FREE_MARGIN)
+    return is_free

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Add pixels to the measured ones of a depth map, where the votes of known pixels confirm them."""
+"""Add pixels to the measured ones of a depth map, where the votes of known pixels confirm them.
+
+Known pixels are those with a depth. Boundary pixels and pixels between the measured ones are added.
+"""
 
 from __future__ import annotations
 
@@ -34,19 +37,20 @@ from densify.geometry.compiled import Kernel, inlined
 
 LEAST_SHARE = 0.97
 """Share of the votes for a boundary pixel that is kept."""
-_FILL_SHARE, _STAR_SHARE = 0.9, 0.8  # share of the votes for a filled pixel
-_NUM_SIZES = 3  # of the windows, up to a half size of a spacing of rays
+_FILL_SHARE, _STAR_SHARE = 0.9, 0.8  # share of the votes for a pixel of `fill`, of `fill_stars`
+_NUM_SIZES = 3  # number of window sizes, up to a half size of a spacing of rays
 _RIDGE_PX2 = 1e-7  # see `densify.depth.patches.plane`
-_MIN_PLANE_PX = 6  # fewer do not distinguish a plane from a step
-_MOST_PX = 120  # greatest half size of a window
+_MIN_PLANE_PX = 6  # fewer pixels do not distinguish a plane from a step
+_MOST_PX = 120  # greatest half size of a window, limits the time
 _MIN_MET = len(DIRECTIONS) // 2  # least number of directions with a known pixel
-_GAP_TOO_WIDE = len(DIRECTIONS) // 2  # number of neighbouring directions without a known pixel
+# Number of neighbouring directions without a known pixel from which the hole is open to one side
+_OPEN_SIDE = len(DIRECTIONS) // 2
 _STAR_SPREAD = 0.1  # greatest difference between the predictions, as a share of inverse depth
-_SPOT_PX = 4  # greatest half width of a spot
+_SPOT_PX = 4  # greatest radius of a laser's spot
 
 
 def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
-    """Accept boundary pixels with 97 % of the votes (rims ``image``), all (``keep``) or none."""
+    """Accept boundary pixels by ``project.rims``: by votes (``image``), all (``keep``) or none."""
     pixel = np.flatnonzero(record.boundary_m)
     depth_m = record.boundary_m.flat[pixel]
     if record.lab.size:
@@ -69,26 +73,26 @@ def fill(record: MapRecord, reach: float) -> None:
 
 def _reject_unconfirmed(record: MapRecord, empty: Bool, least_share: float) -> None:
     """Reject filled pixels that were ``empty`` (H,W) and have less than this share of votes."""
-    filled = empty & (record.filled_m > 0)
-    pixel = np.flatnonzero(filled)
-    # Only measured pixels vote, because filled pixels would confirm themselves. Boundary pixels
-    # that were not accepted may only vote against. This protects the pillar of a car, which has few
-    # measured pixels.
+    is_new = empty & (record.filled_m > 0)
+    pixel = np.flatnonzero(is_new)
+    # Filled pixels have no vote, because they would confirm themselves. The share is the lesser one
+    # with and without the boundary pixels that were not accepted, which can only lower it. This
+    # protects the pillar of a car, which has few measured pixels.
     maps_m = np.maximum(record.depth_m, record.boundary_m), record.depth_m
     share = votes_for(record, maps_m, pixel, record.filled_m.flat[pixel], with_shifts=False)
     record.votes.flat[pixel] = share
-    rejected = np.zeros_like(filled)
-    rejected.flat[pixel] = share < ROUNDED * least_share
-    record.reject(rejected)
+    is_rejected = np.zeros_like(is_new)
+    is_rejected.flat[pixel] = share < ROUNDED * least_share
+    record.reject(is_rejected)
 
 
 class _Known(NamedTuple):
-    """The K measured pixels of a map, row by row."""
+    """The K known pixels of a map, row by row."""
 
-    # (H,W+1) number of measured pixels above row r or left of column c in row r: the index of the
-    # first measured pixel from there on
+    # (H,W+1) number of known pixels above row r, or left of column c in row r. It is the index of
+    # the first known pixel from there on: [r, left] to [r, right] are those of a part of row r.
     before: NDArray[np.int32]
-    num: NDArray[np.int32]  # (H+1,W+1) integral image of the measured pixels
+    num: NDArray[np.int32]  # (H+1,W+1) integral image: number of known pixels above and left
     column: NDArray[np.int32]  # (K,) column of each pixel
     inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
 
@@ -101,7 +105,7 @@ def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: f
     discontinuity if deviations from a plane differ by more than 0.2 m and 6 % of the nearest depth.
     With fewer than six pixels the depths themselves are compared.
 
-    The pixel gets the depth of the plane. Weights fall to zero just outside the window. The window
+    The pixel gets the depth of the weighted plane in inverse depth. The half size of the window
     grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
     is taken.
 
@@ -117,48 +121,52 @@ def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: f
     _fill.over_rows(filled_m.size, known, spacing_px, reaches, filled_m, tilt)
 
 
-def _known_pixels(filled_m: Float32) -> _Known:
+def _known_pixels(depth_m: Float32) -> _Known:
     """Return the pixels with a depth of a map (H,W)."""
-    measured = filled_m > 0
-    height, width = measured.shape
+    is_known = depth_m > 0
+    height, width = is_known.shape
     before = np.zeros((height, width + 1), np.int32)
-    np.cumsum(measured, axis=1, dtype=np.int32, out=before[:, 1:])
+    np.cumsum(is_known, axis=1, dtype=np.int32, out=before[:, 1:])
     num = np.zeros((height + 1, width + 1), np.int32)
     np.cumsum(before, axis=0, out=num[1:])
     before += num[:-1, -1:]  # the pixels of the rows above
-    column = np.nonzero(measured)[1].astype(np.int32)
-    return _Known(before, num, column, inverse=1 / filled_m[measured].astype(np.float64))
+    column = np.nonzero(is_known)[1].astype(np.int32)
+    return _Known(before, num, column, inverse=1 / depth_m[is_known].astype(np.float64))
 
 
 @inlined
-def _any(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
-    """Return True if a rectangle has measured pixels, by the integral image ``num``."""
+def _has_known(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    """Return True if a rectangle has known pixels, by the integral image ``num``."""
     return num[bottom, right] - num[top, right] - num[bottom, left] + num[top, left] > 0
 
 
 @inlined
-def _surrounded(num, window, row, column):  # type: ignore[no-untyped-def]
-    """Return True if a window has measured pixels to the left, to the right, above and below."""
+def _is_surrounded(num, window, row, column):  # type: ignore[no-untyped-def]
+    """Return True if a window has known pixels to the left, to the right, above and below."""
     top, bottom, left, right = window
     return (
-        _any(num, top, bottom, left, column)
-        and _any(num, top, bottom, column + 1, right)
-        and _any(num, top, row, left, right)
-        and _any(num, row + 1, bottom, left, right)
+        _has_known(num, top, bottom, left, column)
+        and _has_known(num, top, bottom, column + 1, right)
+        and _has_known(num, top, row, left, right)
+        and _has_known(num, row + 1, bottom, left, right)
     )
 
 
 @inlined
 def _sum_up(known, window, row, column, moments):  # type: ignore[no-untyped-def]
-    """Fill in a window's ``moments`` (9,); return pixels, nearest and farthest inverse depth."""
+    """Fill in the ``moments`` (9,) of a window's known pixels, for `plane` around (row, column).
+
+    Returns their number, and the inverse depths (1/m) of the nearest and of the farthest.
+    """
     top, bottom, left, right = window
+    # The image may cut the window on one side.
     reach_v, reach_u = max(row - top, bottom - 1 - row), max(column - left, right - 1 - column)
     num, nearest, farthest = 0, 0.0, np.inf
     moments[:] = 0.0
     for r in range(top, bottom):
         for k in range(known.before[r, left], known.before[r, right]):
             inverse, du, dv = known.inverse[k], known.column[k] - column, r - row
-            # The weight falls to 0 just beyond the reach (px).
+            # The weight falls to 0 one pixel outside the window.
             weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
             add_moments(moments, weight, du, dv, inverse)
             num, nearest, farthest = num + 1, max(nearest, inverse), min(farthest, inverse)
@@ -167,7 +175,7 @@ def _sum_up(known, window, row, column, moments):  # type: ignore[no-untyped-def
 
 @inlined
 def _spread(known, window, row, column, centre, slope_u, slope_v):  # type: ignore[no-untyped-def]
-    """Return the range of the deviations of a window's pixels from a plane, in inverse depth."""
+    """Return the greatest minus the least deviation (1/m) of a window's pixels from a plane."""
     top, bottom, left, right = window
     low, high = np.inf, -np.inf
     for r in range(top, bottom):
@@ -187,26 +195,26 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
         row, column = p // width, p % width
         if filled_m[row, column] > 0:
             continue
-        tried_u, tried_v = 0, 0
-        for step in range(len(reaches)):
-            # The window, unless it is that of the step before
-            across_px = reaches[step] * spacing_px[row, column, 0]
-            down_px = reaches[step] * spacing_px[row, column, 1]
+        last_u, last_v = 0, 0  # half size of the last window
+        for reach in reaches:
+            # The window, unless rounding makes it equal to the last one
+            across_px = reach * spacing_px[row, column, 0]
+            down_px = reach * spacing_px[row, column, 1]
             reach_u = min(max(int(np.rint(across_px)), 1), _MOST_PX)
             reach_v = min(max(int(np.rint(down_px)), 1), _MOST_PX)
-            if reach_u == tried_u and reach_v == tried_v:
+            if reach_u == last_u and reach_v == last_v:
                 continue
-            tried_u, tried_v = reach_u, reach_v
+            last_u, last_v = reach_u, reach_v
             window = (
                 max(row - reach_v, 0),
                 min(row + reach_v + 1, height),
                 max(column - reach_u, 0),
                 min(column + reach_u + 1, width),
             )
-            if not _surrounded(known.num, window, row, column):
+            if not _is_surrounded(known.num, window, row, column):
                 continue
 
-            # A depth discontinuity: few pixels are compared by their depths, more by a plane.
+            # No depth discontinuity: few pixels are compared by their depths, more by a plane.
             num, nearest, farthest = _sum_up(known, window, row, column, moments)
             allowed_m = max(HIDDEN_M, HIDDEN_FRACTION / nearest)
             if num < _MIN_PLANE_PX and 1 / farthest - 1 / nearest > allowed_m:
@@ -225,9 +233,10 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
 def fill_stars(record: MapRecord) -> None:
     """Fill holes from the first known pixel, measured or filled, in each of 16 directions.
 
-    At least eight directions need a known pixel within a ray spacing, at most seven neighbouring
-    ones none. Their surfaces, extended to the hole, must agree to 10 % of inverse depth. The mean,
-    weighted by the reciprocal of the steps, needs eight tenths of the votes.
+    At least eight directions need a known pixel within a ray spacing. At most seven directions in a
+    row may have none, or the depth would be extrapolated. The surfaces of the known pixels,
+    extended to the hole, must agree to 10 % of inverse depth. The pixel gets their mean, weighted
+    by the reciprocal of the number of steps. It needs eight tenths of the votes.
     """
     empty = record.filled_m == 0
     pixel = np.flatnonzero(empty)
@@ -250,7 +259,7 @@ def _widest_gap(met):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[no-untyped-def]
-    """Predict the depth of empty pixels from the first known pixels around them, 0 for none."""
+    """Fill ``predicted_m`` (P,) with the depths of `fill_stars` at empty pixels, 0 for none."""
     width = known.inverse.shape[1]
     met = np.empty(len(DIRECTIONS), np.bool_)
     for p in range(first, last):
@@ -268,7 +277,7 @@ def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[n
                 weighted_sum += inverse / k
                 sum_weights += 1 / k
                 num += 1
-        if num < _MIN_MET or _widest_gap(met) >= _GAP_TOO_WIDE:
+        if num < _MIN_MET or _widest_gap(met) >= _OPEN_SIDE:
             continue
         mean = weighted_sum / sum_weights
         if nearest - farthest <= _STAR_SPREAD * mean:
@@ -277,6 +286,7 @@ def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[n
 
 def measure_spots(record: MapRecord) -> None:
     """Count filled pixels as measured, in depth unchanged, if a return's laser spot covers them."""
+    # The spot of the return that measured each pixel
     points = record.points
     measured = np.flatnonzero(record.depth_m > 0)
     index_in_image = np.zeros(len(record.reason), np.int64)  # by index in the cloud
@@ -285,35 +295,40 @@ def measure_spots(record: MapRecord) -> None:
     radius_px = np.minimum(FOOTPRINT * points.spacing_px[point, 0], _SPOT_PX)
     uv = points.uv[point]
 
-    filled_m = np.where(record.depth_m == 0, record.filled_m, np.float32(0))
-    source = np.full(filled_m.shape, -1)
-    nearest_px2 = np.full(filled_m.shape, np.inf)
-    _cover(measured, uv, radius_px, record.depth_m, record.tilt, filled_m, source, nearest_px2)
+    # Each covered pixel takes the source of the nearest such return.
+    interpolated_m = np.where(record.depth_m == 0, record.filled_m, np.float32(0))
+    source = np.full(interpolated_m.shape, -1)  # flat index of a measured pixel
+    least_px2 = np.full(interpolated_m.shape, np.inf)
+    _cover(measured, uv, radius_px, record.depth_m, record.tilt, interpolated_m, source, least_px2)
     covered = np.flatnonzero(source >= 0)
     record.depth_m.flat[covered] = record.filled_m.flat[covered]
     record.point.flat[covered] = record.point.flat[source.flat[covered]]
 
 
 @Kernel
-def _cover(pixel, uv, radius_px, depth_m, tilt, filled_m, source_pixel, nearest_px2):  # type: ignore[no-untyped-def]
-    """Find for each filled pixel the nearest measured pixel whose spot covers it, -1 for none."""
-    height, width = filled_m.shape
+def _cover(pixel, uv, radius_px, depth_m, tilt, interpolated_m, source, least_px2):  # type: ignore[no-untyped-def]
+    """Fill ``source`` (H,W) with the measured pixel whose spot covers each interpolated pixel.
+
+    The spots of the measured pixels, flat indices ``pixel`` (P,), have the centres ``uv`` (P,2) and
+    radii (P,). The nearest centre counts; ``least_px2`` (H,W) is its squared distance, inf before.
+    """
+    height, width = interpolated_m.shape
     for i in range(len(pixel)):
         v, u = pixel[i] // width, pixel[i] % width
         return_m = depth_m[v, u]
         reach = int(radius_px[i] + 0.5)  # the spot's centre is up to half a pixel from the pixel's
         for row in range(max(v - reach, 0), min(v + reach + 1, height)):
             for column in range(max(u - reach, 0), min(u + reach + 1, width)):
-                fill_m = filled_m[row, column]
+                fill_m = interpolated_m[row, column]
                 if fill_m == 0:
                     continue
                 px2 = (column - uv[i, 0]) ** 2 + (row - uv[i, 1]) ** 2
-                if px2 > radius_px[i] * radius_px[i] or px2 >= nearest_px2[row, column]:
+                if px2 > radius_px[i] * radius_px[i] or px2 >= least_px2[row, column]:
                     continue
                 # The surface of the return, extended to the pixel, must have the depth of the fill.
                 # Compared are fill / surface - 1, and the tolerance as a share of the surface.
                 inverse = 1 / return_m + (column - u) * tilt[v, u, 0] + (row - v) * tilt[v, u, 1]
                 tolerance_m = AGREE_M + AGREE_FRACTION * return_m
                 if abs(fill_m * inverse - 1) <= tolerance_m * abs(inverse):
-                    nearest_px2[row, column] = px2
-                    source_pixel[row, column] = pixel[i]
+                    least_px2[row, column] = px2
+                    source[row, column] = pixel[i]

@@ -2,15 +2,16 @@
 """Define the record of a depth map in the making, and measure its pixels by the points in an image.
 
 Of the visible points in a pixel, the one nearest in time to the key sweep wins. The pixel gets the
-depth of a plane through the points around that agree. It is measured if, of all sweeps around it,
-the one nearest to the key agrees; close to a depth discontinuity it becomes a boundary pixel.
+depth of a plane through the points around it that agree with the winner. The pixel is measured if
+the sweep nearest to the key, of all sweeps with points around it, is among those that agree. Close
+to a depth discontinuity it becomes a boundary pixel instead.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,18 +32,23 @@ from densify.depth.patches import (
     sorted_by_pixel,
 )
 from densify.depth.rays import MovingBody, Rays
+from densify.geometry.arrays import select_rows
 from densify.geometry.compiled import Kernel, inlined
 from densify.geometry.types import Bool, Camera, Cloud, Float32, Int, Patches, Reason
 
-_REACH = 0.65  # radius of the plane and of the sweeps that agree, in spacings of rays
-_SLACK_M = 0.15 * AGREE_M  # added to the radius of a discontinuity, for errors of registration
-_EDGE_WINDOW_PX = 1.5  # width beyond the edge in which points must continue the surface
-# Sweeps beyond the window share errors, and continue a surface behind a nearer one.
+# Half size of the window around a pixel whose points are compared with the winner, in spacings of
+# rays, and its limits: more than half a spacing, so that neighbouring rays are in it
+_REACH = 0.65
+_LEAST_PX, _MOST_PX = 3, 24
+_SLACK_M = 0.15 * AGREE_M  # added to the radius of a laser's spot, for errors of registration
+_EDGE_WINDOW_PX = 1.5  # width beyond the spot in which points show if the surface goes on
+# Beyond the window, least number of sweeps that agree, and least distance from a discontinuity in
+# radii of a spot. Both are stricter than in the window: these sweeps share errors of registration,
+# and may measure a background through the gaps of a nearer surface.
 _FAR_SWEEPS, _FAR_EDGE = 6, 1.5
 _RIDGE_PX2 = 0.02  # see `densify.depth.patches.plane`
-_LEAST_PX, _MOST_PX = 3, 24  # limits of the plane's radius
 ALL_ROUND = 3.0
-"""Extent of a surface without a depth discontinuity nearby, in radii of a discontinuity."""
+"""Extent of a surface without a depth discontinuity nearby, in radii of a laser's spot."""
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
 # Rows of the array that `_settle` fills
@@ -76,8 +82,8 @@ class MapRecord:
     # background. Accepted boundary pixels keep this value too.
     boundary_m: Float32
     filled_m: Float32  # depth of accepted and of interpolated pixels
-    rejected_m: Float32  # depth of pixels that rules rejected
-    confidence: Float32  # of pixels with a filled or rejected depth
+    rejected_m: Float32  # depth of pixels that a stage has rejected
+    confidence: Float32  # confidence, 0 to 1, of pixels with a filled or rejected depth
     point: NDArray[np.int32]  # index, in the cloud, of the point that measured the pixel; -1 none
     tilt: Float32  # (H,W,2) slope of the surface's inverse depth to the right and down, 1/m per px
     # (H,W,2) spacing of neighbouring rays of one sweep, across and down, at all pixels
@@ -85,7 +91,9 @@ class MapRecord:
     # (H,W) share of the image's votes for the depth of a boundary pixel, a filled or a rejected
     # pixel; 1 without a vote
     votes: Float32
-    edge: Float32  # (H,W) distance of measured pixels from a discontinuity, in radii of a spot
+    # (H,W) distance of measured pixels from a depth discontinuity, in radii of a laser's spot;
+    # `ALL_ROUND` if none is near
+    edge: Float32
     on_body: Bool  # (H,W) True on bodies of moving objects (`MovingBody`)
     lab: Float32  # (H,W,3) camera image in L*a*b*, (0,0,3) if there is no image
     points: PointsInImage  # points of the cloud in the image
@@ -100,17 +108,16 @@ class MapRecord:
 
     def box(self, box: tuple[slice, slice]) -> MapRecord:
         """Return a box of rows and columns as views: writing to the box changes this record."""
-        # The other fields are images.
-        names = {field.name for field in fields(self)} - {"points", "reason", "evidence"}
-        return replace(self, **{name: getattr(self, name)[box] for name in names})
+        image_names = {field.name for field in fields(self)} - {"points", "reason", "evidence"}
+        return replace(self, **{name: getattr(self, name)[box] for name in image_names})
 
-    def reject(self, dropped: Bool) -> None:
-        """Remove pixels ``dropped`` (H,W) from the filled map; measured ones become boundary."""
-        dropped = dropped & (self.filled_m > 0)
-        np.copyto(self.boundary_m, self.depth_m, where=dropped & (self.depth_m > 0))
-        np.copyto(self.rejected_m, self.filled_m, where=dropped)
-        self.depth_m[dropped] = 0
-        self.filled_m[dropped] = 0
+    def reject(self, mask: Bool) -> None:
+        """Move the depths of a mask (H,W) to ``rejected_m``; measured ones become boundary."""
+        rejected = mask & (self.filled_m > 0)
+        np.copyto(self.boundary_m, self.depth_m, where=rejected & (self.depth_m > 0))
+        np.copyto(self.rejected_m, self.filled_m, where=rejected)
+        self.depth_m[rejected] = 0
+        self.filled_m[rejected] = 0
 
 
 def measure(inputs: MapInputs) -> MapRecord:
@@ -120,7 +127,8 @@ def measure(inputs: MapInputs) -> MapRecord:
     """
     camera = inputs.camera
     points = points_in_image(inputs.cloud, inputs.view, inputs.patches)
-    in_window = points.take(np.flatnonzero(~points.far)) if points.far.any() else points
+    in_window = select_rows(points, ~points.far) if points.far.any() else points
+    # The spacing of rays is that of the window's sweeps, unless none of their points is in view.
     record = _empty_record(inputs, points, spaced=points if points.far.all() else in_window)
     if not inputs.settings.visibility:
         _measure_nearest(record, points, camera)
@@ -155,7 +163,7 @@ def _empty_record(inputs: MapInputs, points: PointsInImage, spaced: PointsInImag
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
-    """Return the (H,W,2) spacing of rays across and down, the mean over blocks of pixels."""
+    """Return the (H,W,2) spacing of rays across and down in px, means over blocks of pixels."""
     height, width = (-(-size // _BLOCK_PX) for size in shape)  # in blocks, rounded up
     row, column = pixel_of(points.uv)
     block = row // _BLOCK_PX * width + column // _BLOCK_PX
@@ -183,7 +191,8 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
 
 def _measure_nearest(record: MapRecord, points: PointsInImage, camera: Camera) -> None:
     """Measure each pixel by its nearest point, without occlusion or support tests."""
-    start, order = sorted_by_pixel(points, np.zeros(len(points.rows), np.int64), camera)
+    equal_rank = np.zeros(len(points.rows), np.int64)  # the depth decides
+    start, order = sorted_by_pixel(points, equal_rank, camera)
     pixel = np.flatnonzero(np.diff(start))  # pixels with a point
     nearest = order[start[pixel]]
     record.reason[points.rows] = Reason.NOT_CHOSEN
@@ -205,50 +214,50 @@ class _Winners(NamedTuple):
     point: Int  # (P,) indices of the winners among the points in the image
     depth_m: Float32  # (P,) depth of the plane at the pixel's centre
     num_sweeps: Float32  # (P,) number of sweeps that agree with the plane
-    is_nearest: Float32  # (P,) 1 if the sweep nearest to the key is among them, else 0
-    edge: Float32  # (P,) distance from a discontinuity, in radii of a discontinuity
-
-    def select(self, keep: Bool) -> _Winners:
-        """Return the pixels where ``keep`` (P,) is True."""
-        columns: Any = (column[keep] for column in self)
-        return _Winners(*columns)
+    # (P,) 1 if, of the sweeps around the pixel, the one nearest to the key is among them, else 0
+    is_nearest: Float32
+    edge: Float32  # (P,) distance from a discontinuity, in radii of a laser's spot
 
 
 def _measure_visible(
     record: MapRecord, points: PointsInImage, camera: Camera, beyond_window: bool = False
 ) -> None:
-    """Measure pixels without a depth by visible points, and set the reason of each point."""
-    hidden = is_occluded(points, camera)
-    winners = _find_winners(record, points, hidden, camera)
-    reasons = np.where(hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
+    """Measure pixels without a depth by visible points, and set the reason of each point.
+
+    The points are those of the window, or with ``beyond_window`` all, of which the window's stay.
+    """
+    is_hidden = is_occluded(points, camera)
+    winners = _find_winners(record, points, is_hidden, camera)
+    reasons = np.where(is_hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     if beyond_window:
-        # Beyond the window the sweep nearest to the key need not agree, but six sweeps must.
+        # The sweep nearest to the key need not agree, but six sweeps must, and there are no
+        # boundary pixels.
         is_supported = winners.num_sweeps >= _FAR_SWEEPS
         is_inside = winners.edge >= _FAR_EDGE
         is_used = is_supported & is_inside
         reasons[winners.point[~is_inside]] = Reason.EDGE
-        judged = points.far
+        is_judged = points.far
     else:
         is_supported = winners.is_nearest > 0
         is_inside = winners.edge >= 1  # else it is a boundary pixel
         is_used = is_supported
-        judged = ~points.far
+        is_judged = ~points.far
     reasons[winners.point[~is_supported]] = Reason.UNSUPPORTED
-    record.reason[points.rows[judged]] = reasons[judged]
-    _set_pixels(record, points, winners.select(is_used), is_inside[is_used])
+    record.reason[points.rows[is_judged]] = reasons[is_judged]
+    _set_pixels(record, points, select_rows(winners, is_used), is_inside[is_used])
 
 
 def _find_winners(
-    record: MapRecord, points: PointsInImage, hidden: Bool, camera: Camera
+    record: MapRecord, points: PointsInImage, is_hidden: Bool, camera: Camera
 ) -> _Winners:
-    """Return the winners of the pixels without a depth; ``hidden`` (K,) marks occluded points."""
-    # Hidden points rank behind the oldest visible one, so a pixel's first point is its winner.
+    """Return the winners of the pixels without a depth; occluded points (K,) win no pixel."""
+    # Occluded points rank behind the oldest visible one, so a pixel's first point is its winner.
     hidden_rank = int(points.age_ns.max(initial=0)) + 1
-    rank = np.where(hidden, hidden_rank, points.age_ns)
+    rank = np.where(is_hidden, hidden_rank, points.age_ns)
     start, order = sorted_by_pixel(points, rank, camera)
     has_depth = record.depth_m > 0
     settled = np.zeros((_NUM_SETTLED, has_depth.size), np.float32)
-    by_pixel = _ByPixel(points.take(order), hidden[order], start, has_depth.shape)
+    by_pixel = _ByPixel(select_rows(points, order), is_hidden[order], start, has_depth.shape)
     _settle.over_rows(has_depth.size, by_pixel, has_depth.ravel(), settled)
     pixel = np.flatnonzero(settled[_DEPTH])
     return _Winners(
@@ -276,7 +285,7 @@ class _ByPixel(NamedTuple):
     """Points in an image sorted by pixel, occluded points last in each pixel."""
 
     points: PointsInImage
-    hidden: Bool  # (K,) True for occluded points
+    is_hidden: Bool  # (K,) True for occluded points
     start: Int  # (H·W+1,) index of each pixel's first point
     shape: tuple[int, ...]  # height and width of the image
 
@@ -288,13 +297,13 @@ def _window(reach_px):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _extend(reach, u, v):  # type: ignore[no-untyped-def]
-    """Raise ``reach`` (8,), the extent of the surface in eight directions, by a point at (u, v)."""
-    reach[0], reach[1] = max(reach[0], u), max(reach[1], -u)
-    reach[2], reach[3] = max(reach[2], v), max(reach[3], -v)
+def _extend(extent, u, v):  # type: ignore[no-untyped-def]
+    """Raise ``extent`` (8,), px of the surface in eight directions, by a point at (u, v)."""
+    extent[0], extent[1] = max(extent[0], u), max(extent[1], -u)
+    extent[2], extent[3] = max(extent[2], v), max(extent[3], -v)
     falling, rising = np.sqrt(0.5) * (u + v), np.sqrt(0.5) * (u - v)  # along the diagonals
-    reach[4], reach[5] = max(reach[4], falling), max(reach[5], -falling)
-    reach[6], reach[7] = max(reach[6], rising), max(reach[7], -rising)
+    extent[4], extent[5] = max(extent[4], falling), max(extent[5], -falling)
+    extent[6], extent[7] = max(extent[6], rising), max(extent[7], -rising)
 
 
 @inlined
@@ -308,70 +317,81 @@ def _count(bits):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _compare(by_pixel, i, u0, v0, centre, tolerance, outer, moments, reach):  # type: ignore[no-untyped-def]
-    """Compare the points around pixel (v0, u0) with point i's plane: agreeing sweeps, two tests."""
-    points, hidden, start, shape = by_pixel
+def _compare(by_pixel, i, u0, v0, centre, tolerance, edge_px, moments, extent):  # type: ignore[no-untyped-def]
+    """Compare the points around pixel (v0, u0) with the tangent plane of its winner, point i.
+
+    The plane has the inverse depth ``centre`` (1/m) at the pixel. A point agrees if it deviates by
+    at most ``tolerance`` (1/m). Its deviation is added to ``moments`` (9,). In a square of half
+    size ``edge_px`` it raises ``extent`` (8,).
+
+    Returns:
+        sweeps: Bit set of the agreeing sweeps in the window.
+        is_nearest: True if no other sweep in the window is nearer in time to the key.
+        has_background: True if a point in the square is clearly behind the plane.
+    """
+    points, is_hidden, start, shape = by_pixel
     uv, inverse, age_ns = points.uv, points.inverse, points.age_ns
     slope_u, slope_v, inverse_i = points.slope[i, 0], points.slope[i, 1], inverse[i]
-    behind_step = (HIDDEN_M + HIDDEN_FRACTION / inverse_i) * inverse_i * inverse_i  # 1/m
+    # A step of depth (m), times the squared inverse depth, is one of inverse depth (1/m).
+    background_step = (HIDDEN_M + HIDDEN_FRACTION / inverse_i) * inverse_i * inverse_i
     reach_u = _window(_REACH * points.spacing_px[i, 0])
     reach_v = _window(_REACH * points.spacing_px[i, 1])
-    wide_u, wide_v = max(reach_u, _window(outer)), max(reach_v, _window(outer))
-    sweeps, behind = np.int64(0), False
-    agree_ns = other_ns = age_ns[i]
+    wide_u, wide_v = max(reach_u, _window(edge_px)), max(reach_v, _window(edge_px))
+    sweeps, has_background = np.int64(0), False
+    agreeing_ns = other_ns = age_ns[i]  # ages of the sweeps nearest to the key
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
             k = np.uint64(j)  # unsigned, so that no access checks for a negative index
             du, dv = uv[k, 0] - u0, uv[k, 1] - v0
             deviation = inverse[k] - (centre + slope_u * du + slope_v * dv)
-            is_close = abs(du) <= outer and abs(dv) <= outer
+            is_close = abs(du) <= edge_px and abs(dv) <= edge_px
             # Points anywhere in the window's last pixel column count, hence half a pixel more.
             in_window = abs(du) <= reach_u + 0.5 and abs(v - v0) <= reach_v
-            if hidden[k] or abs(deviation) > tolerance:
-                behind |= is_close and deviation < -behind_step
+            if is_hidden[k] or abs(deviation) > tolerance:
+                has_background |= is_close and deviation < -background_step
                 other_ns = min(other_ns, age_ns[k]) if in_window else other_ns
                 continue
             # No branches: half of them would be predicted wrongly. A bit of 63 for each sweep.
             sweeps |= np.int64(in_window) << np.int64(points.frame[k] % 63)
-            agree_ns = min(agree_ns, age_ns[k]) if in_window else agree_ns
-            _extend(reach, du if is_close else 0.0, dv if is_close else 0.0)
+            agreeing_ns = min(agreeing_ns, age_ns[k]) if in_window else agreeing_ns
+            _extend(extent, du if is_close else 0.0, dv if is_close else 0.0)
             # The weight falls to 0 just outside the window.
             weight = max(1 - abs(du) / (reach_u + 1), 0.0) * max(1 - abs(dv) / (reach_v + 1), 0.0)
             add_moments(moments, weight, du, dv, deviation)
-    return sweeps, agree_ns <= other_ns, behind
+    return sweeps, agreeing_ns <= other_ns, has_background
 
 
 @Kernel
-def _settle(first, last, by_pixel, done, settled):  # type: ignore[no-untyped-def]
-    """Fill ``settled`` (4,P): depth (m), agreeing sweeps, 1 if none nearer disagrees, extent."""
-    moments, reach = np.empty(9), np.empty(8)
+def _settle(first, last, by_pixel, has_depth, settled):  # type: ignore[no-untyped-def]
+    """Fill ``settled`` (4,P), as in `_Winners`, at pixels without a depth that have a winner."""
+    moments, extent = np.empty(9), np.empty(8)
     points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
     for p in range(first, last):
         i = start[p]
-        if done[p] or i == start[p + 1] or by_pixel.hidden[i]:
+        if has_depth[p] or i == start[p + 1] or by_pixel.is_hidden[i]:
             continue
 
-        # The tangent plane of the pixel's first point, in the pixel's centre
+        # The tangent plane of the winner, at the pixel's centre
         v0, u0 = p // width, p % width
         inverse, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
         centre = inverse + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
+        # In inverse depth (1/m), as in `_compare`
         tolerance = (AGREE_M + AGREE_FRACTION / inverse) * inverse * inverse
-        inner = FOOTPRINT * points.spacing_px[i, 0] + _SLACK_M * points.focal_px[i, 0] * inverse
-        outer = inner + _EDGE_WINDOW_PX
+        spot_px = FOOTPRINT * points.spacing_px[i, 0] + _SLACK_M * points.focal_px[i, 0] * inverse
 
-        moments[:], reach[:] = 0.0, 0.0
-        sweeps, is_nearest, behind = _compare(
-            by_pixel, i, u0, v0, centre, tolerance, outer, moments, reach
+        # The depth: the plane, corrected by the mean deviation of the agreeing points
+        moments[:], extent[:] = 0.0, 0.0
+        sweeps, is_nearest, has_background = _compare(
+            by_pixel, i, u0, v0, centre, tolerance, spot_px + _EDGE_WINDOW_PX, moments, extent
         )
         deviation, _, _ = plane(moments, _RIDGE_PX2)
         deviation = min(max(deviation, -tolerance), tolerance)
         settled[_DEPTH, p] = 1 / limit_inverse(centre + deviation, inverse)
         settled[_SWEEPS, p] = _count(sweeps)
         settled[_NEAREST, p] = is_nearest
+
+        # The discontinuity is where the surface ends first.
         settled[_EDGE, p] = ALL_ROUND
-        if behind and inner > 0:
-            least_extent = reach[0]
-            for extent in reach[1:]:
-                least_extent = min(least_extent, extent)
-            settled[_EDGE, p] = least_extent / inner
+        if has_background and spot_px > 0:
+            settled[_EDGE, p] = extent.min() / spot_px

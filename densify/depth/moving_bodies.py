@@ -26,14 +26,15 @@ from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
 
 _PRIOR = 0.05  # number of rays that end on the body, assumed everywhere
-_WHOLE = 0.8  # closed share of the front from which a body is closed as a whole, as a car is
-# Least share of rays that end on a closed body, and on the closed part of an open one. At glass it
+_COMPACT = 0.8  # closed share of the front from which all of a body is closed, as a car is
+# Least share of rays that end on a compact body, and on the closed part of another one. At glass it
 # is a third.
-_LEAST_OF_WHOLE, _LEAST_OF_OPEN = 0.2, 0.5
-_VOTES_OF_WHOLE = 0.75  # least share of the votes along the silhouette of a closed body
+_LEAST_OF_COMPACT, _LEAST_OF_OTHER = 0.2, 0.5
+_VOTES_OF_COMPACT = 0.75  # least share of the votes along the silhouette of a compact body
 _DEEP_M = 3 * HIDDEN_M  # farther behind the front of the hull are seats, axles and the far side
-_STIFF, _HELD = 3.0, 0.01  # weights of a smooth and of a small offset, against one return
-_ROUNDING = float(np.finfo(np.float32).eps)  # of the stored depth
+# Weights of the difference of neighbouring offsets and of an offset itself, against one return
+_SMOOTHNESS, _TOWARDS_HULL = 3.0, 0.01
+_ROUNDING = float(np.finfo(np.float32).eps)  # relative rounding error of the stored depth
 _AGREES = 2.0  # tolerance, as a multiple of that between two static points of a surface
 
 
@@ -62,7 +63,7 @@ def find_far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: F
 
 
 def fronts(bodies: Iterable[MovingBody], exposure: Exposure) -> Float:
-    """Return (H,W) inverse depths of the nearest front of the bodies' hulls in 1/m, 0 for none."""
+    """Return (H,W) inverse depths of the nearest front of the bodies in 1/m, 0 for none."""
     inverse = np.zeros((exposure.camera.height_px, exposure.camera.width_px))
     for body in bodies:
         front = _Front.of(body, exposure, 0)
@@ -87,21 +88,22 @@ class _Front(NamedTuple):
         box = _image_box(sight, exposure, margin_px)
         row, column = np.mgrid[box]
 
-        # The ray of each pixel enters the hull at its front.
+        # The viewing ray of each pixel enters the hull at its front.
         uv = np.column_stack([column.ravel(), row.ravel()]).astype(np.float64)
         ray = cameras.rays(camera, uv)
-        enter, leave = find_crossing(half_spaces(sight.points_cam), np.zeros(3), ray)
-        inside = (enter > 0) & (enter < leave)
-        depth_m = exposure.depth_m(np.where(inside, enter, 1)[:, None] * ray)
-        inside &= depth_m > cameras.NEAREST_M
-        if not inside.any():
+        enter_m, leave_m = find_crossing(half_spaces(sight.points_cam), np.zeros(3), ray)
+        meets = (enter_m > 0) & (enter_m < leave_m)
+        depth_m = exposure.depth_m(np.where(meets, enter_m, 1)[:, None] * ray)
+        meets &= depth_m > cameras.NEAREST_M
+        if not meets.any():
             return None
-        inverse = np.divide(1, depth_m, out=np.zeros(len(ray)), where=inside)
+        inverse = np.divide(1, depth_m, out=np.zeros(len(ray)), where=meets)
         return _Front(box, inverse.reshape(row.shape))
 
     def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
         """Return those of the points (N,3), key sweep's lidar frame, that lie within the box."""
         sight = exposure.see(points, velocity_m_s)
+        # Points out of view may have no coordinates: NaN has no pixel.
         row, column = pixel_of(np.where(sight.inside[:, None], sight.uv, -1))
         box_row = row - self.box[0].start
         box_column = column - self.box[1].start
@@ -119,18 +121,19 @@ class _Front(NamedTuple):
 
     def closed_share(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
         """Return the (h,w) share, 0 to 1, of the rays entering at a pixel that end on the body."""
+        # Each ray counts in the pixel where it enters the hull, blurred by the spot of the laser.
         blur_px = np.maximum(FOOTPRINT * np.median(spacing_px, axis=(0, 1)), 1.0)
         entered = self.pixels(exposure, body.entries, body.velocity_m_s)
         # Rays that enter behind the front, on the far side of the hull, do not count.
         front_m = 1 / np.maximum(self.inverse[entered.pixel], 1e-6)
-        at_front = entered.depth_m < front_m + hidden_m(front_m)
+        is_at_front = entered.depth_m < front_m + hidden_m(front_m)
         counts = np.zeros((2, *self.inverse.shape))  # of rays that pass, and that end
         ends = body.ends[entered.point].astype(np.int64)
-        np.add.at(counts, (ends, *entered.pixel), at_front)
+        np.add.at(counts, (ends, *entered.pixel), is_at_front)
         num_passed, num_ended = (
             cv2.GaussianBlur(count, (0, 0), blur_px[0], sigmaY=blur_px[1]) for count in counts
         )
-        # After the blur, _PRIOR rays that end in a pixel have this density in it.
+        # The blur, a Gaussian, leaves this part of _PRIOR rays in the pixel where they end.
         num_ended = num_ended + _PRIOR / (2 * np.pi * blur_px.prod())
         share: Float = np.where(self.inverse > 0, num_ended / (num_ended + num_passed), 0)
         return share
@@ -186,11 +189,13 @@ def _close(
 def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
     """Return the (h,w) inverse depth (1/m) of a body's surface; arguments as in `_close`."""
     inside = front.inverse > 0
-    known_m = np.maximum(record.depth_m, record.boundary_m)
-    on_body = inside & (known_m > 0) & np.isin(record.point, rows)
-    # Returns from deep inside, such as those from seats, are not on the surface.
-    on_body &= known_m * front.inverse < 1 + _DEEP_M * front.inverse
-    offset = 1 / np.where(on_body, known_m, 1) - front.inverse
+    measured_m = np.maximum(record.depth_m, record.boundary_m)
+    on_body = inside & (measured_m > 0) & np.isin(record.point, rows)
+    # Returns from deep inside, such as those from seats, are not on the surface: the test is
+    # measured_m < front + _DEEP_M, times the inverse depth of the front.
+    on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
+    # The surface is the front of the hull, with a smooth offset through the returns.
+    offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
     surface: Float = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
     return surface
 
@@ -205,22 +210,26 @@ class _Shown(NamedTuple):
 def _show(
     record: MapRecord, cloud: Cloud, surface: Float, allowed_m: Float | Float32, share: Float
 ) -> _Shown:
-    """Show a body's surface (h,w), 1/m, in the record; returns may be ``allowed_m`` (h,w) off."""
+    """Show a body's surface (h,w), 1/m, in the record, and return where.
+
+    Returns of moving objects up to ``allowed_m`` (h,w) behind it stay. ``share`` (h,w) is that of
+    the rays that end on the body, 0 outside its hull.
+    """
     inside = share > 0
     surface_m = (1 / surface).astype(np.float32)
-    is_whole = (share[inside] >= _LEAST_OF_OPEN).mean() >= _WHOLE
+    is_compact = (share[inside] >= _LEAST_OF_OTHER).mean() >= _COMPACT
 
     # The core is well inside the closed part. It shows the body, unless something is in front.
-    in_front = (record.filled_m > 0) & (record.filled_m < surface_m - hidden_m(surface_m))
-    closed = share >= (_LEAST_OF_WHOLE if is_whole else _LEAST_OF_OPEN)
-    core = _well_inside(closed, float(np.median(record.gap_px[inside]))) & ~in_front
+    is_hidden = (record.filled_m > 0) & (record.filled_m < surface_m - hidden_m(surface_m))
+    is_closed = share >= (_LEAST_OF_COMPACT if is_compact else _LEAST_OF_OTHER)
+    core = _erode(is_closed, float(np.median(record.gap_px[inside]))) & ~is_hidden
 
     # In the outline only depths of moving objects in front of the surface, or on it, stay.
     is_moving = (record.depth_m > 0) & cloud.moving[record.point]
     stays = is_moving & (record.depth_m <= surface_m + allowed_m)
-    outline = inside & ~in_front & ~core & ~stays
-    if not is_whole:
-        outline &= share >= _LEAST_OF_WHOLE
+    outline = inside & ~is_hidden & ~core & ~stays
+    if not is_compact:
+        outline &= share >= _LEAST_OF_COMPACT
     for layer_m in (record.depth_m, record.filled_m, record.rejected_m):
         layer_m[outline] = 0  # a background seen past a moving object is not given back
 
@@ -231,29 +240,29 @@ def _show(
 
     # The votes decide the silhouette.
     pixel = np.flatnonzero(outline)
-    share_for = votes_for(
-        record, [record.filled_m], pixel, surface_m[outline], with_shifts=not is_whole
+    votes = votes_for(
+        record, [record.filled_m], pixel, surface_m[outline], with_shifts=not is_compact
     )
-    least_share = _VOTES_OF_WHOLE if is_whole else LEAST_SHARE
+    least_share = _VOTES_OF_COMPACT if is_compact else LEAST_SHARE
     shown = core.copy()
-    shown[outline] = share_for >= ROUNDED * least_share
-    record.votes[outline] = share_for
+    shown[outline] = votes >= ROUNDED * least_share
+    record.votes[outline] = votes
     record.filled_m[shown] = surface_m[shown]
     record.on_body |= shown
-    return _Shown(shown, measurable=shown if is_whole else core)
+    return _Shown(shown, measurable=shown if is_compact else core)
 
 
-def _well_inside(closed: Bool, away_px: float) -> Bool:
-    """Return the closed pixels farther than ``away_px`` from any open pixel of the box."""
-    # With a border, a box without an open pixel has distances too.
-    padded = np.pad(closed, 1, mode="edge").astype(np.uint8)
+def _erode(mask: Bool, margin_px: float) -> Bool:
+    """Return the pixels of a mask farther than ``margin_px`` from any other pixel of the box."""
+    # With a border, a mask of the whole box has distances too.
+    padded = np.pad(mask, 1, mode="edge").astype(np.uint8)
     distance_px = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    inside: Bool = distance_px > away_px
-    return inside
+    eroded: Bool = distance_px > margin_px
+    return eroded
 
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
-    """Return the (h,w) smooth offset (1/m) inside a body's outline, near the known offset."""
+    """Return the (h,w) smooth offset (1/m) inside a body's outline, near the ``known`` offsets."""
     # Pairs of neighbouring pixels inside, by their numbers
     number = np.cumsum(inside).reshape(inside.shape) - 1
     pair_right = inside[:, :-1] & inside[:, 1:]
@@ -262,12 +271,12 @@ def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
     second = np.concatenate([number[:, 1:][pair_right], number[1:][pair_down]])
     num_pixels = int(inside.sum())
     shape = (num_pixels, num_pixels)
-    half = sparse.coo_matrix((np.full(len(first), _STIFF), (first, second)), shape).tocsr()
-    ties = half + half.T
+    half = sparse.coo_matrix((np.full(len(first), _SMOOTHNESS), (first, second)), shape).tocsr()
+    ties = half + half.T  # symmetric
 
-    # The offset o minimises Σ known (o - offset)² + _STIFF Σ |∇o|² + _HELD Σ o².
+    # The offset o minimises Σ known (o - offset)² + _SMOOTHNESS Σ |∇o|² + _TOWARDS_HULL Σ o².
     weight = known[inside].astype(np.float64)
-    diagonal = np.asarray(ties.sum(axis=1)).ravel() + weight + _HELD
+    diagonal = np.asarray(ties.sum(axis=1)).ravel() + weight + _TOWARDS_HULL
     system = (sparse.diags(diagonal) - ties).tocsr()
     smooth_offset = np.zeros(inside.shape)
     smooth_offset[inside] = cg(system, weight * offset[inside], rtol=_ROUNDING)[0]

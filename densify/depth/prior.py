@@ -27,8 +27,9 @@ _FORMS = {"auto": ("depth", "log", "inverse"), "depth": ("depth", "log"), "inver
 _MIN_FITTED = 100  # least number of measured pixels for a fit
 _WRONG = np.log(1.25)  # least error of a wrong pixel, in the logarithm of depth
 _MOST_CONFIDENCE = 0.2  # greatest confidence of a pixel of the prior
-_USUAL = 0.05  # error of a prior in the logarithm of depth; a step of more than twice is an edge
-_MAX_CELLS = 40_000  # greatest number of cells, about
+# Usual error of a prior in the logarithm of depth. A step of more than twice is an edge.
+_USUAL = 0.05
+_MAX_CELLS = 40_000  # about the greatest number of cells, limits the time of the sparse solver
 _SMOOTHNESS = 10.0  # weight of equal corrections, relative to 1 for a cell with all pixels known
 _TOWARDS_NONE = 0.002  # pull to no correction and the mean error, far from known pixels
 _NEIGHBOURHOOD = np.ones((5, 5), np.uint8)
@@ -105,18 +106,17 @@ def _fit_form(form: str, p: Float, z: Float) -> PriorFit:
     """Fit one form of curve to values p (N,) and depths z (N,) by medians in steps of depth."""
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
+    # Pixels of a step have about equal depth. Medians tolerate outliers among them.
     step = np.floor(np.log(z / z.min()) / _USUAL).astype(np.int64)
     num_pixels = np.bincount(step)
     steps = np.flatnonzero(num_pixels)
-    # Measured depth counts as exact, the prior's values do not. Medians tolerate a tenth of
-    # outliers.
     median_p = ndimage.median(p, step, steps)
     median_z = ndimage.median(z, step, steps)
     scale, shift = _fit_curve(form, median_p, median_z)
 
     curve = PriorFit(form, scale, shift, np.inf, 1.0, False)
     deviation = np.abs(_log_depth(p, curve) - np.log(z))
-    # Together the pixels of a step weigh the root of their number.
+    # Together the pixels of a step weigh the root of their number: most pixels are near.
     weight = 1 / np.sqrt(num_pixels)[step]
     residual = float(np.average(np.minimum(deviation, _WRONG), weights=weight))
     wrong_share = float(np.average(deviation > _WRONG, weights=weight))
@@ -163,7 +163,7 @@ def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
 class _Cells(NamedTuple):
     """The image in square cells of ``size`` pixels, R rows and C columns."""
 
-    size: int
+    size: int  # side of a cell in px
     guide: Float  # (R,C) logarithm of depth at the central pixel of each cell
     number: Int  # (H,W) number of each pixel's cell, row by row
 
@@ -222,15 +222,15 @@ def _correction(
     """Return (H,W) the correction of the prior's log depth, and (H,W) its remaining error."""
     cells = _Cells.over(guide)
     area, num_cells = cells.size**2, cells.guide.size
-    # Pixels on another surface than the centre of their cell do not tie the cell.
+    # Known pixels pull their cell, unless they are on another surface than its centre.
     centre_guide = cells.guide.ravel()[cells.number]
-    ties = usable & (filled_m > 0) & (np.abs(guide - centre_guide) < _USUAL)
-    cell = cells.number[ties]
-    deviation = np.log(filled_m[ties].astype(np.float64)) - log_depth[ties]
+    pulls = usable & (filled_m > 0) & (np.abs(guide - centre_guide) < _USUAL)
+    cell = cells.number[pulls]
+    deviation = np.log(filled_m[pulls].astype(np.float64)) - log_depth[pulls]
     membrane = cells.membrane()
 
     def solve_membrane(weight: Float, values: Float, elsewhere: float) -> Float:
-        """Return the (RC,) membrane pulled to values (N,), and to ``elsewhere`` without any."""
+        """Return the (RC,) membrane pulled to values (N,), and to ``elsewhere`` far from them."""
         diagonal = np.bincount(cell, weight, num_cells) / area + _TOWARDS_NONE
         pull = np.bincount(cell, weight * values, num_cells) / area + _TOWARDS_NONE * elsewhere
         system = (membrane + sparse.diags_array(diagonal)).tocsc()
@@ -238,7 +238,7 @@ def _correction(
         return solution
 
     # A steep prior may be blurred. Differences there have little weight.
-    flatness_weight = _robust_weight(steepness[ties])
+    flatness_weight = _robust_weight(steepness[pulls])
     mean_error = 0.0
     if len(deviation):
         mean_error = float(np.average(np.abs(deviation), weights=flatness_weight))

@@ -27,16 +27,16 @@ from densify.geometry import poses
 from densify.geometry.types import Bool, Camera, Cloud, DepthMap, Float, Float32, Reason, Rejected
 
 _LEAST_CONFIDENCE = np.float32(1) / np.iinfo(np.uint8).max  # stored as 1; 0 is no depth
-_SHARE = 0.25  # share of passing rays above which a pixel is rejected
-_NUM_STEPS = 6  # number of steps of the search for a crossing
+_MAX_PASSING = 0.25  # share of passing rays above which a pixel is rejected
+_NUM_ITERATIONS = 6  # number of iterations of the search for a crossing
 
 
 class _Stage(NamedTuple):
     """A stage of a record's way to a depth map."""
 
-    applies: bool
+    applies: bool  # False skips the stage
     stage: Callable[..., None]  # changes the record, its first argument, in place
-    arguments: tuple[Any, ...] = ()  # the others
+    arguments: tuple[Any, ...] = ()  # its other arguments
 
 
 def project(inputs: MapInputs) -> DepthMap:
@@ -145,8 +145,8 @@ def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Ray
     shape = record.filled_m.shape
     num_passed = _counts(crossings_uv, shape, blur_px)
     num_stopped = _counts(stopped_uv, shape, blur_px)
-    seen_through = num_passed > _SHARE * (num_passed + num_stopped)
-    record.reject(seen_through & ~record.on_body)
+    is_seen_through = num_passed > _MAX_PASSING * (num_passed + num_stopped)
+    record.reject(is_seen_through & ~record.on_body)
 
 
 def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
@@ -177,28 +177,32 @@ def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure:
     end_m = exposure.depth_m(end_cam)
     no_velocity = np.zeros(to_key.shape, np.float32)
     sight = exposure.see(to_key, no_velocity)
-    uv, valid = sight.uv, sight.inside
+    uv, is_valid = sight.uv, sight.inside
     depth_m = np.full(len(to_key), np.inf)
-    for _ in range(_NUM_STEPS):
-        before_m = depth_m
-        pixel = pixel_of(np.where(valid[:, None], uv, 0))
+    for _ in range(_NUM_ITERATIONS):
+        last_depth_m = depth_m
+        pixel = pixel_of(np.where(is_valid[:, None], uv, 0))
         depth_m = surface_m[pixel].astype(np.float64)
         with np.errstate(invalid="ignore"):
-            is_same = abs(depth_m - before_m) <= agree_m(before_m)
+            is_same = abs(depth_m - last_depth_m) <= agree_m(last_depth_m)
 
-        share = _share(start_cam, end_cam, depth_m, exposure.measure)
-        valid &= (depth_m > 0) & (share > 0) & (share < 1)
-        share = np.where(valid, share, 1.0)[:, None]
+        # On to the point of the ray at this depth; a ray that does not reach it is dropped.
+        share = _share_at_depth(start_cam, end_cam, depth_m, exposure.measure)
+        is_valid &= (depth_m > 0) & (share > 0) & (share < 1)
+        share = np.where(is_valid, share, 1.0)[:, None]
         sight = exposure.see(from_key + share * (to_key - from_key), no_velocity)
         uv = sight.uv
-        valid = valid & sight.inside
-    crosses = valid & is_same & (end_m - depth_m > hidden_m(depth_m))
+        is_valid = is_valid & sight.inside
+    crosses = is_valid & is_same & (end_m - depth_m > hidden_m(depth_m))
     crossings_uv: Float = uv[crosses]
     return crossings_uv
 
 
-def _share(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
-    """Return the (P,) share of the path at this depth, camera frame, NaN if it is not reached."""
+def _share_at_depth(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
+    """Return the (P,) share of the way from start to end (P,3), camera frame, at these depths.
+
+    It is not finite, or not between 0 and 1, if the way does not reach the depth.
+    """
     path = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
         if measure == "z":

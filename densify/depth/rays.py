@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Follow the rays of a window's sweeps: where they start, and how they meet moving objects.
 
-These rays are moved along with the object to the key sweep's time: where they end on its hull its
-body is closed, where they pass it is open. Where no ray was, its box grows to the usual size of a
-vehicle of its width or length, and down to the ground.
+Rays toward a moving object are moved along with it to the key sweep's time. Where they end on its
+hull its body is closed, where they pass through it is open. Where no ray shows free space, its box
+grows to the usual size of a vehicle of its width or length, and down to the ground.
 """
 
 from __future__ import annotations
@@ -20,19 +20,21 @@ from densify.depth.exposure import Exposure
 from densify.depth.patches import AGREE_M, HIDDEN_M
 from densify.free_space.ground import HeightMap
 from densify.geometry import poses
+from densify.geometry.arrays import joined_rows, select_rows
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int, ObjectTrack, Stretch, Sweep
 
 _NEAR_M = 2.5 * AGREE_M  # distance within which a point of a body has other points of it
-_LEAST_NEAR = 6  # least number of these points
+_LEAST_NEAR = 6  # least number of these points; others are outliers
 _SIDES = (("rear", "front"), ("right", "left"), ("bottom", "top"))
-# Distance of rays to a side that is seen; tolerates errors of motion and registration.
+# Greatest distance of free space from a side that is seen; tolerates errors of motion and
+# registration
 _BESIDE_M = 2 * HIDDEN_M
-_NUM_RAYS = 3  # rays that show free space; single rays may be mixed echoes
+_NUM_RAYS = 3  # number of rays that show free space; single rays may be mixed echoes
 _MIDDLE = 0.6  # share of a side, around its middle, that is flat; corners are round
 _BODY = (0.2, 0.5)  # shares of the height: from above the road to below the windows
-_CAR_WIDE_M = 1.4  # the narrowest cars are wider, other road users narrower
-_CAR_LONG_M = 3.0  # shorter objects may be people and bicycles
-_LENGTH_OF_WIDTH = 2.4  # of cars: 1.65 by 4.0 m, 1.85 by 4.4 m
+_CAR_WIDTH_M = 1.4  # width from which an object may be a car; other road users are narrower
+_CAR_LENGTH_M = 3.0  # the same of the length; shorter objects may be people and bicycles
+_LENGTH_PER_WIDTH = 2.4  # of cars: 1.65 by 4.0 m, 1.85 by 4.4 m
 _WIDEST_M = 2.55  # greatest width of a vehicle by law
 
 
@@ -49,10 +51,10 @@ class Rays:
         for frame in np.unique(cloud.frame).tolist():
             rows = np.flatnonzero(cloud.frame == frame)
             registered = self.stretch[frame]
-            origins_by_scanner = _scanner_origins(registered.sweep)
-            origin = origins_by_scanner[cloud.lidar[rows]]
+            origin = _scanner_origins(registered.sweep)[cloud.lidar[rows]]
             offset_ns = registered.sweep.offset_ns
             if offset_ns is not None:
+                # From the reference time to the firing time the scanner moves with the lidar.
                 returns = _find_returns(registered.sweep, cloud.row[rows])
                 offset_s = offset_ns[returns, None] * 1e-9
                 twist: Float = np.where(
@@ -89,7 +91,7 @@ def _find_returns(sweep: Sweep, numbers: Int) -> Int:
 
 def half_spaces(corners: Float) -> Float:
     """Return the (F,4) sides n, d of the corners' (V,3) convex hull, inside if n · x + d ≤ 0."""
-    return np.unique(ConvexHull(corners).equations, axis=0)
+    return np.unique(ConvexHull(corners).equations, axis=0)  # one for all triangles of a side
 
 
 def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Float]:
@@ -109,9 +111,11 @@ def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float,
             # to a side and outside it would enter.
             slope = direction @ side[:3] + 0.0
             t = (start @ -side[:3] - side[3]) / slope
-            inward = slope < 0
-            np.maximum(enter, np.where(inward, t, -np.inf), out=enter)
-            np.fmin(leave, np.where(inward, np.inf, t), out=leave)
+            # The line enters where it has passed all sides inwards, and leaves at the first
+            # outwards.
+            is_inward = slope < 0
+            np.maximum(enter, np.where(is_inward, t, -np.inf), out=enter)
+            np.fmin(leave, np.where(is_inward, np.inf, t), out=leave)
     return enter, leave
 
 
@@ -132,15 +136,13 @@ class ObjectRays(NamedTuple):
     start: Float  # (K,3) origin of each ray
     to_return: Float  # (K,3) vector from the origin to the return
 
-    def select(self, keep: Bool) -> ObjectRays:
-        """Return the rays where ``keep`` (K,) is True."""
-        return ObjectRays(self.rows[keep], self.start[keep], self.to_return[keep])
-
 
 def rays_toward(
     cloud: Cloud, rays: Rays, rows_of: Mapping[int, Int], corners: Mapping[int, Float]
 ) -> dict[int, ObjectRays]:
     """Return the rays of all sweeps that may meet the hull of each object, by instance number.
+
+    Only sweeps with points of the object count: they tell its motion.
 
     Args:
         cloud: The cloud that the rays measured.
@@ -152,14 +154,7 @@ def rays_toward(
     for frame in rays.stretch.frames if rows_of else ():
         for instance, object_rays in _sweep_rays(cloud, rays, frame, rows_of, corners).items():
             by_sweep[instance].append(object_rays)
-    return {
-        instance: ObjectRays(
-            np.concatenate([part.rows for part in parts]),
-            np.concatenate([part.start for part in parts]),
-            np.concatenate([part.to_return for part in parts]),
-        )
-        for instance, parts in by_sweep.items()
-    }
+    return {instance: joined_rows(parts) for instance, parts in by_sweep.items()}
 
 
 def _sweep_rays(
@@ -170,31 +165,33 @@ def _sweep_rays(
     corners: Mapping[int, Float],
 ) -> dict[int, ObjectRays]:
     """Return the rays of one sweep as `rays_toward`, for the objects that the sweep observes."""
-    # Motions of the objects from the sweep to the key, in the key's lidar frame
+    # Motions of the objects from the sweep's to the key's time, in the key's lidar frame
     motions = dict[int, Float]()
     for instance, rows in rows_of.items():
-        own = rows[cloud.frame[rows] == frame]
-        if len(own):
-            motions[instance] = poses.fit_rigid(cloud.rigid_points[own], cloud.points[own])
+        sweep_rows = rows[cloud.frame[rows] == frame]
+        if len(sweep_rows):
+            motions[instance] = poses.fit_rigid(
+                cloud.rigid_points[sweep_rows], cloud.points[sweep_rows]
+            )
 
-    # Rows of the rays toward each object, by their direction from the lidar
+    # The returns whose rays may meet each object, by their direction from the lidar
     returns = np.flatnonzero(cloud.frame == frame)
     lidar_origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
     from_lidar = cloud.rigid_points.take(returns, axis=0) - lidar_origin
     xy = from_lidar[:, :2].T.astype(np.float32)
     bound_m = rays.origin_bound_m(frame)
-    toward = dict[int, Int]()
+    returns_toward = dict[int, Int]()
     for instance, T_key_sweep in motions.items():
         hull = poses.transform(poses.inverse(T_key_sweep), corners[instance]) - lidar_origin
-        toward[instance] = returns[_may_meet(xy, bound_m, hull)]
+        returns_toward[instance] = returns[_may_meet(xy, bound_m, hull)]
 
     # All origins are found together, and cut into those of each object.
-    all_rows = np.concatenate([returns[:0], *toward.values()])
-    origins = rays.origins_of(cloud.select(all_rows))
+    all_returns = np.concatenate([returns[:0], *returns_toward.values()])
+    origins = rays.origins_of(cloud.select(all_returns))
     object_rays = {}
     first = 0
     for instance, T_key_sweep in motions.items():
-        rows = toward[instance]
+        rows = returns_toward[instance]
         start = poses.transform(T_key_sweep, origins[first : first + len(rows)])
         end = poses.transform(T_key_sweep, cloud.rigid_points[rows])
         object_rays[instance] = ObjectRays(rows, start, end - start)
@@ -203,20 +200,23 @@ def _sweep_rays(
 
 
 def _may_meet(xy: Float32, bound_m: float, corners: Float) -> Bool:
-    """Return (N,) True for returns at xy (2,N) m whose rays may meet a hull with corners (V,3)."""
+    """Return (N,) True for returns at xy (2,N) m whose rays may meet a hull with corners (V,3).
+
+    Both are relative to the lidar. Rays start at most ``bound_m`` from it.
+    """
     x, y, _ = corners.T
     middle = np.array([x.mean(), y.mean()])
     range_m = np.hypot(*middle)
     radius_m = np.hypot(x - middle[0], y - middle[1]).max() + bound_m
     if range_m <= radius_m:
         return np.ones(xy.shape[1], bool)
-    # The cone from the lidar that touches a circle around the hull
+    # The sector from the lidar that touches a circle around the hull, from the circle on
     axis_x, axis_y = (middle / range_m).astype(np.float32)
-    tangent = np.float32(radius_m / np.sqrt(range_m**2 - radius_m**2))
-    along_m = axis_x * xy[0] + axis_y * xy[1]
-    aside_m = axis_y * xy[0] - axis_x * xy[1]
-    meets: Bool = (along_m > range_m - radius_m) & (abs(aside_m) <= tangent * along_m)
-    return meets
+    tangent = np.float32(radius_m / np.sqrt(range_m**2 - radius_m**2))  # of half its angle
+    forward_m = axis_x * xy[0] + axis_y * xy[1]
+    sideways_m = axis_y * xy[0] - axis_x * xy[1]
+    may_meet: Bool = (forward_m > range_m - radius_m) & (abs(sideways_m) <= tangent * forward_m)
+    return may_meet
 
 
 class MovingBody(NamedTuple):
@@ -233,7 +233,10 @@ class MovingBody(NamedTuple):
 def find_moving_bodies(
     cloud: Cloud, rays: Rays, exposures: Collection[Exposure]
 ) -> dict[int, MovingBody]:
-    """Return the bodies, if of any volume, of moving objects a camera sees, by instance number."""
+    """Return the bodies of moving objects, by instance number.
+
+    An object has a body if its points span a volume and one of the ``exposures`` shows it.
+    """
     moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
     instance_of = cloud.instance[moving]
     rows_of = {
@@ -266,10 +269,8 @@ def without_sweep(
     for instance, body in bodies.items():
         corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
         if len(corners):
-            keep = body.frame != frame
-            reduced_bodies[instance] = MovingBody(
-                corners, body.velocity_m_s, body.entries[keep], body.ends[keep], body.frame[keep]
-            )
+            others = select_rows(body, body.frame != frame, ("entries", "ends", "frame"))
+            reduced_bodies[instance] = others._replace(corners=corners)
     return reduced_bodies
 
 
@@ -288,16 +289,16 @@ def _body(
     cloud: Cloud, instance: int, corners: Float, velocity_m_s: Float32, rays: ObjectRays
 ) -> MovingBody:
     """Return the body with this hull (V,3), and those of the ``rays`` that meet the hull."""
-    rays = rays.select(passes_near(corners, rays.start, rays.to_return))
-    enter, leave = find_crossing(half_spaces(corners), rays.start, rays.to_return)
+    near = select_rows(rays, passes_near(corners, rays.start, rays.to_return))
+    enter, leave = find_crossing(half_spaces(corners), near.start, near.to_return)
     meets = (enter > 0) & (enter < np.minimum(leave, 1))  # 0 is the origin, 1 the return
-    rays = rays.select(meets)
+    rows, start, to_return = select_rows(near, meets)
     return MovingBody(
         corners=corners,
         velocity_m_s=velocity_m_s,
-        entries=rays.start + enter[meets, None] * rays.to_return,
-        ends=cloud.moving[rays.rows] & (cloud.instance[rays.rows] == instance),
-        frame=cloud.frame[rays.rows],
+        entries=start + enter[meets, None] * to_return,
+        ends=cloud.moving[rows] & (cloud.instance[rows] == instance),
+        frame=cloud.frame[rows],
     )
 
 
@@ -329,13 +330,13 @@ def complete_boxes(
 
 
 def _missing_m(size_m: Float) -> Float:
-    """Return the (3,) metres that length, width and height lack to those of a usual vehicle."""
+    """Return the (3,) metres that a box lacks to a usual vehicle: length, width, height (0)."""
     length_m, width_m, _ = size_m
     missing_m = np.zeros(3)
-    if length_m >= _CAR_LONG_M:
-        missing_m[1] = max(0.0, min(length_m / _LENGTH_OF_WIDTH, _WIDEST_M) - width_m)
-    if width_m >= _CAR_WIDE_M:
-        missing_m[0] = max(0.0, _LENGTH_OF_WIDTH * width_m - length_m)
+    if length_m >= _CAR_LENGTH_M:
+        missing_m[1] = max(0.0, min(length_m / _LENGTH_PER_WIDTH, _WIDEST_M) - width_m)
+    if width_m >= _CAR_WIDTH_M:
+        missing_m[0] = max(0.0, _LENGTH_PER_WIDTH * width_m - length_m)
     return missing_m
 
 
@@ -344,16 +345,16 @@ def _lower_to_ground(track: ObjectTrack, rays: Rays, ground: HeightMap) -> Objec
     T_key_object = track.T_key_object[track.frames.index(rays.key)]
     corners = poses.transform(T_key_object, corners_of(track.size_m))
     T_world_key = rays.stretch[rays.key].T_world_lidar
-    bottom = corners[::2]
+    bottom = corners[::2]  # every other corner
     above_m = float(np.median(ground.above(poses.transform(T_world_key, bottom))))
     return grow_box(track, 2, max(above_m, 0.0), 0.0)
 
 
 def _reach_corners(track: ObjectTrack, key: int) -> Float:
-    """Return the (8,3) corners at the key of all space that decides about a track's box."""
-    wider_m = 2 * (_missing_m(track.size_m) + _BESIDE_M)  # at both ends of each axis
+    """Return the (8,3) corners, key frame, of the space into which a track's box may grow."""
+    growth_m = 2 * (_missing_m(track.size_m) + _BESIDE_M)  # at both ends of each axis
     T_key_object = track.T_key_object[track.frames.index(key)]
-    return poses.transform(T_key_object, corners_of(track.size_m + wider_m))
+    return poses.transform(T_key_object, corners_of(track.size_m + growth_m))
 
 
 def corners_of(size_m: Float) -> Float:
@@ -365,43 +366,51 @@ def corners_of(size_m: Float) -> Float:
 
 def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectTrack:
     """Return a track with its completed box, from rays (K,3) in the object's frame at the key."""
-    sides_seen = list[str]()
+    # Rays that cross the space into which the box may grow, between origin (0) and return (1)
     missing_m = _missing_m(track.size_m)
     reach_m = track.size_m / 2 + missing_m + _BESIDE_M
     enter, leave = find_crossing(_box_spaces(-reach_m, reach_m), start, to_return)
-    meets = (enter < leave) & (leave > 0) & (enter < 1)
-    start, to_return = start[meets], to_return[meets]
-    size_m = track.size_m  # the rays are in the frame of this box
+    crosses = (enter < leave) & (leave > 0) & (enter < 1)
+    start, to_return = start[crosses], to_return[crosses]
+
+    completed = track
+    sides_seen = list[str]()
     for axis, sides in enumerate(_SIDES):
-        # At the lower and at the upper end of the axis; a seen side stays where it is.
-        free_m = [_free_m(size_m, missing_m, axis, sign, start, to_return) for sign in (-1, 1)]
-        room_m = [0.0 if end_m <= _BESIDE_M else end_m for end_m in free_m]
-        sides_seen += [
-            side for side, end_m in zip(sides, free_m, strict=True) if end_m <= _BESIDE_M
+        # At the lower and at the upper end of the axis. The rays are in the frame of the first box.
+        free_m = [
+            _free_m(track.size_m, missing_m, axis, sign, start, to_return) for sign in (-1, 1)
         ]
+        is_seen = [end_m <= _BESIDE_M for end_m in free_m]
+        sides_seen += [side for side, seen in zip(sides, is_seen, strict=True) if seen]
+        # A seen side stays where it is. Free space limits the growth of the other.
+        room_m = [0.0 if seen else end_m for seen, end_m in zip(is_seen, free_m, strict=True)]
         if missing_m[axis] > 0 and sum(room_m):
             growth_m = _share_growth(float(missing_m[axis]), room_m)
-            track = grow_box(track, axis, *growth_m)
-    return replace(track, sides_seen=tuple(side for side in sides_seen if side != "bottom"))
+            completed = grow_box(completed, axis, *growth_m)
+    return replace(completed, sides_seen=tuple(side for side in sides_seen if side != "bottom"))
 
 
 def _share_growth(missing_m: float, room_m: Sequence[float]) -> list[float]:
     """Return the growth of the two ends of a box in metres, within the room at each end."""
     # Equal parts, if there is room at both ends. An end takes what the other has no room for.
-    part_m = [min(end_m, missing_m / (1 + all(room_m))) for end_m in room_m]
-    left_m = missing_m - sum(part_m)
-    return [min(room, part + left_m) for room, part in zip(room_m, part_m, strict=True)]
+    num_ends = 1 + all(room_m)
+    part_m = [min(end_m, missing_m / num_ends) for end_m in room_m]
+    rest_m = missing_m - sum(part_m)
+    return [min(end_m, part + rest_m) for end_m, part in zip(room_m, part_m, strict=True)]
 
 
 def _free_m(
     size_m: Float, missing_m: Float, axis: int, sign: int, start: Float, to_return: Float
 ) -> float:
-    """Return the metres from a side of a box to the nearest free space outside; inf for none."""
+    """Return the metres from a side of a box to the nearest free space outside; inf for none.
+
+    The side is at the lower (``sign`` -1) or upper (1) end of ``axis``. Free space is where three
+    rays (K,3), in the frame of the box, pass. It is looked for up to where the box may grow.
+    """
     # The space outside the flat part of the side; vertical sides are tested below the windows.
-    half = np.stack([-size_m / 2, size_m / 2])
-    low, high = _MIDDLE * half
+    low, high = -_MIDDLE * size_m / 2, _MIDDLE * size_m / 2
     if axis < 2:
-        low[2], high[2] = half[0, 2] + np.array(_BODY) * size_m[2]
+        low[2], high[2] = -size_m[2] / 2 + np.array(_BODY) * size_m[2]
     reach_m = missing_m[axis] + _BESIDE_M
     side_m = sign * size_m[axis] / 2
     low[axis], high[axis] = sorted([side_m, side_m + sign * reach_m])
@@ -412,8 +421,7 @@ def _free_m(
     crosses = enter < leave
     start_m, ray_m = start[crosses, axis], to_return[crosses, axis]
     ends_m = np.stack([start_m + enter[crosses] * ray_m, start_m + leave[crosses] * ray_m])
-    distance_m = np.sort(np.min(sign * ends_m, axis=0) - abs(side_m))
-    # Fewer rays may be mixed echoes.
+    distance_m = np.sort(np.min(sign * ends_m, axis=0) - abs(side_m))  # of each ray's nearer end
     return float(distance_m[_NUM_RAYS - 1]) if len(distance_m) >= _NUM_RAYS else np.inf
 
 

@@ -23,7 +23,7 @@ from densify.depth.rays import MovingBody, Rays, find_moving_bodies, without_swe
 from densify.depth.votes import to_lab
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
-from densify.geometry.cameras import converted
+from densify.geometry.cameras import convert_depth
 from densify.geometry.types import (
     Bool,
     CameraView,
@@ -35,7 +35,7 @@ from densify.geometry.types import (
     Mover,
     Patches,
     Reason,
-    StandingWorld,
+    StaticWorld,
     Stretch,
     Sweep,
     Truth,
@@ -148,11 +148,11 @@ class Views:
         return find_moving_bodies(cloud, self.rays, self.exposures.values())
 
     def see_far(
-        self, world: StandingWorld, T_key_world: Float, stretch: Stretch, standing_only: bool
+        self, world: StaticWorld, T_key_world: Float, stretch: Stretch, static_only: bool
     ) -> SeenCloud:
         """Return the points of sweeps beyond the window as cameras see them, see `far_cloud`."""
         cloud, surface = far_cloud(
-            world, T_key_world, stretch, self.key, self.exposures, standing_only
+            world, T_key_world, stretch, self.key, self.exposures, static_only
         )
         return SeenCloud(cloud, surface, self.points_in_view(cloud))
 
@@ -235,7 +235,7 @@ class Views:
             if exposure.number is not None:
                 camera = exposure.camera
                 depth_m = truth.depth_m(camera.name, exposure.number)
-                depth_m = converted(camera, depth_m, camera.measure, exposure.measure)
+                depth_m = convert_depth(camera, depth_m, camera.measure, exposure.measure)
                 true_maps[name] = (depth_m, truth.moving_mask(camera.name, exposure.number))
         return true_maps
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Let the known pixels around a pixel vote on its depth, by their surfaces and the camera image.
 
-The first known pixel in each of 16 directions votes, with less weight the more the image's colours
-change in between, as in a bilateral grid or in geodesic matting.
+Known pixels are those with a depth. The first one in each of 16 directions votes, with less weight
+the more the image's colours change in between, as in a bilateral grid or in geodesic matting.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ VOTERS_REACH = 6.0
 """Greatest distance of a voting pixel, in spacings of neighbouring rays."""
 _DECAY = 1.2  # distance at which a vote counts half, in spacings of neighbouring rays
 _COLOURS = 6.0  # standard deviation of the colours of a surface, in L*a*b*
-_THROUGH = 0.001  # weight of a vote across an edge of the image
+_ACROSS_EDGE = 0.001  # least weight of a vote, across an edge of the image
 _STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to a voter
-_DOUBT = 0.04  # weight of a constant vote, half of it for the depth and half against
-_ASIDE = 0.6  # tested shift of the image, in spacings of neighbouring rays
+# Weight of a constant vote, half of it for the depth and half against. Without it voters that are
+# all beyond edges of the image, and weigh almost nothing, would decide.
+_DOUBT = 0.04
+_SHIFT = 0.6  # tested shift of the image, in spacings of neighbouring rays
 ROUNDED = 1 - 1e-6
-"""Tolerance for rounding of a share of votes."""
+"""Factor of a least share of votes, for rounding errors of the sums."""
 
 
 def to_lab(image: NDArray[np.uint8]) -> Float32:
@@ -44,7 +46,7 @@ def to_lab(image: NDArray[np.uint8]) -> Float32:
 
 
 def _directions() -> NDArray[np.int64]:
-    """Return (16,2,2) offsets as in `DIRECTIONS`."""
+    """Return the `DIRECTIONS`."""
     right, below, diagonal = (1, 0), (0, 1), (1, 1)
     # Four directions, from the right to almost below. Turned by quarters they give all.
     quarter = np.array([(right, (2, 0)), (right, (2, 1)), (diagonal, (2, 2)), (below, (1, 2))])
@@ -60,7 +62,7 @@ from the right. Each step goes to one of the eight neighbours."""
 
 def steps_to_known(known: Bool) -> NDArray[np.uint8]:
     """Return (16,H,W) steps to the first known pixel in `DIRECTIONS`, 0 if known, or `NONE`."""
-    # Two steps go up to two pixels beyond the image: there is a border of two on each side.
+    # Two steps reach at most two pixels beyond the image: there is a border of two on each side.
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
     steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
@@ -71,18 +73,19 @@ def steps_to_known(known: Bool) -> NDArray[np.uint8]:
 @Kernel
 def _march(steps):  # type: ignore[no-untyped-def]
     """Fill in steps (16,H+4,W+4), 0 at known pixels; the border of two pixels stays unchanged."""
+    # The steps of a pixel follow from those of the pixels one and two steps on. The rows go against
+    # the direction, so that these are computed before.
     height, width = steps.shape[1:]
     for d in range(len(DIRECTIONS)):
         u1, v1, u2, v2 = DIRECTIONS[d].ravel()
         for i in range(2, height - 2):
-            row = height - 1 - i if v2 > 0 else i  # rows two steps on are done before
+            row = height - 1 - i if v2 > 0 else i
             line = steps[d, row, 2 : width - 2]
-            if v2 == 0:
-                # Within the row each pixel is a step from the one done before.
+            if v2 == 0:  # along the row all steps are equal, and one pixel follows from the next
                 for j in range(len(line)):
                     column = len(line) - 1 - j if u2 > 0 else j
-                    before = steps[d, row, 2 + column + u1]
-                    line[column] = 0 if line[column] == 0 else min(before, 254) + 1
+                    next_steps = steps[d, row, 2 + column + u1]
+                    line[column] = 0 if line[column] == 0 else min(next_steps, 254) + 1
                 continue
             after_one = steps[d, row + v1, 2 + u1 : width - 2 + u1]
             after_two = steps[d, row + v2, 2 + u2 : width - 2 + u2]
@@ -103,7 +106,7 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 
 @inlined
 def extend(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Return the inverse depth that the surface of pixel (v, u) has du columns and dv rows away.
+    """Return the inverse depth (1/m) of the surface of pixel (v, u), extended to (v - dv, u - du).
 
     ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) its slope right and down in 1/m per px.
     """
@@ -154,11 +157,11 @@ def votes_for(
 
 
 @inlined
-def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
-    """Return the number of steps in direction d from row v, column u to the next known pixel."""
+def _steps_to_other(steps, d, v, u):  # type: ignore[no-untyped-def]
+    """Return the steps in direction d from row v, column u to another known pixel, or `NONE`."""
     num_steps = np.int64(steps[d, v, u])
     height, width = steps.shape[1:]
-    # A known pixel has no steps of its own: those of the pixels one and two steps on are taken.
+    # A known pixel is 0 steps from itself: the pixels one and two steps on tell. No iteration else.
     for k in range(1, 3 if num_steps == 0 else 1):
         du, dv = offset(d, k)
         if not (0 <= u + du < width and 0 <= v + dv < height):
@@ -170,71 +173,72 @@ def _steps_to(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _cast_votes(voters, v, u, depth, gap, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in the 16 votes on the pixel in row v, column u; return the numbers for and against."""
-    tolerance_m = HIDDEN_M + HIDDEN_FRACTION * depth
+def _cast_votes(voters, v, u, depth_m, gap_px, steps, agrees):  # type: ignore[no-untyped-def]
+    """Fill in ``steps`` (16,) to the voters (0: none) and ``agrees`` (16,); count for, against."""
+    tolerance_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
     num_for, num_against = 0, 0
     for d in range(len(steps)):
-        k = _steps_to(voters.steps, d, v, u)
+        k = _steps_to_other(voters.steps, d, v, u)
         du, dv = offset(d, k)
         steps[d], agrees[d] = 0, False
-        if k == NONE or max(abs(du), abs(dv)) > VOTERS_REACH * gap:
+        if k == NONE or max(abs(du), abs(dv)) > VOTERS_REACH * gap_px:
             continue
         steps[d] = k
         predicted = extend(voters.inverse, voters.tilt, v + dv, u + du, du, dv)
-        agrees[d] = abs(1 / predicted - depth) <= tolerance_m
+        agrees[d] = abs(1 / predicted - depth_m) <= tolerance_m
         num_for += agrees[d]
         num_against += not agrees[d]
     return num_for, num_against
 
 
 @inlined
-def _colour_weight(lab, v, u, d, k, gap):  # type: ignore[no-untyped-def]
+def _colour_weight(lab, v, u, d, k, gap_px):  # type: ignore[no-untyped-def]
     """Return the weight of a vote by the greatest colour change on k steps in direction d."""
     if lab.size == 0:
-        return 1 + _THROUGH
-    stride = max(np.int64(gap / _STRIDE), 1)
+        return 1 + _ACROSS_EDGE  # as without any change
+    stride = max(np.int64(gap_px / _STRIDE), 1)
     height, width = lab.shape[:2]
+    # Positions beyond the image, which may be shifted, take the colour at its border.
     row, column = min(max(v, 0), height - 1), min(max(u, 0), width - 1)
     light, a, b = lab[row, column, 0], lab[row, column, 1], lab[row, column, 2]
-    change = np.float32(0)
-    # The compared steps end with the voter itself.
+    greatest_squared = np.float32(0)
+    # The first step is chosen so that the last one is the voter itself.
     for step in range((k - 1) % stride + 1, k + 1, stride):
         du, dv = offset(d, step)
         row, column = min(max(v + dv, 0), height - 1), min(max(u + du, 0), width - 1)
         change_light, change_a = lab[row, column, 0] - light, lab[row, column, 1] - a
         change_b = lab[row, column, 2] - b
         squared = change_light * change_light + change_a * change_a + change_b * change_b
-        change = max(change, squared)
-    return np.exp(-0.5 / (_COLOURS * _COLOURS) * change) + _THROUGH
+        greatest_squared = max(greatest_squared, squared)
+    return np.exp(-0.5 / (_COLOURS * _COLOURS) * greatest_squared) + _ACROSS_EDGE
 
 
 @Kernel
 def _vote(first, last, pixel, inverse, voters, lab, gap_px, with_shifts, share):  # type: ignore[no-untyped-def]
     """Fill ``share`` (P,), the result of `votes_for` on inverse depths ``inverse`` (P,) in 1/m."""
-    width, num = gap_px.shape[1], len(DIRECTIONS)
-    steps, agrees = np.empty(num, np.int64), np.empty(num, np.bool_)
+    width, num_directions = gap_px.shape[1], len(DIRECTIONS)
+    steps, agrees = np.empty(num_directions, np.int64), np.empty(num_directions, np.bool_)
     doubt = _DOUBT if with_shifts else 0.0
     for i in range(first, last):
         v, u = pixel[i] // width, pixel[i] % width
         gap = gap_px[v, u]
         num_for, num_against = _cast_votes(voters, v, u, 1 / inverse[i], gap, steps, agrees)
         if not with_shifts and (num_for == 0 or num_against == 0):
-            share[i] = num_for > 0  # all votes are equal, whatever they weigh
+            share[i] = num_for > 0  # all votes are equal, or there is none
             continue
-        shift = np.int64(np.rint(_ASIDE * gap)) if with_shifts else 0
+        shift_px = np.int64(np.rint(_SHIFT * gap)) if with_shifts else 0
         least_share = 1.0
-        # The image unshifted, then shifted to the right, left, down and up
-        for side in range(5 if shift else 1):
-            down = shift * ((side == 3) - (side == 4))
-            right = shift * ((side == 1) - (side == 2))
+        # Colours at the pixel, then to the right, left, below and above
+        for side in range(5 if shift_px else 1):
+            down = shift_px * ((side == 3) - (side == 4))
+            right = shift_px * ((side == 1) - (side == 2))
             sum_for, sum_all = 0.5 * doubt, doubt  # half of the constant vote is for the depth
-            for d in range(num):
+            for d in range(num_directions):
                 k = steps[d]
                 if k == 0:
                     continue
-                likeness = _colour_weight(lab, v + down, u + right, d, k, gap)
-                weight = likeness / (1 + k / (_DECAY * gap))
+                colour_weight = _colour_weight(lab, v + down, u + right, d, k, gap)
+                weight = colour_weight / (1 + k / (_DECAY * gap))
                 sum_all += weight
                 sum_for += weight * agrees[d]
             least_share = min(least_share, sum_for / sum_all)

@@ -12,7 +12,7 @@ from densify.config import Config
 from densify.config.plugins import engine
 from densify.flow.tracking.candidates import Candidates, find_candidates
 from densify.free_space.ground import HeightMap
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry.types import Motion, Stretch
 
 

@@ -17,14 +17,14 @@ from densify.geometry.types import Bool, Float, Float32, Int, Stretch, Sweep
 ABOVE_GROUND_M = 0.2
 """Height above the ground below which points are part of it and never start a moving object."""
 _BELOW_M = 0.5  # points this far below the ground are no surface: mirror images, multipath
-_STRAY = 0.02  # largest share of the points of a cell that are mirror images or noise
+_OUTLIER_SHARE = 0.02  # largest share of the points of a cell that are mirror images or noise
 _DENSE_M = 30.0  # range within which every sweep measures the ground
 _MOST_CELLS = 1 << 18  # largest grid, 512 m x 512 m
-CELL_M = 1.0  # smaller cells follow kerbs, larger ones bridge holes
+CELL_M = 1.0  # side of a cell; smaller cells follow kerbs, larger ones bridge holes
 MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
-_WINDOW = 7  # cells; a narrower hump or pit is not ground
+_WINDOW = 7  # width in cells; a narrower hump or pit is not ground
 
-_NUM_POINTS, _NUM_TRIES = 2000, 200  # points and sampled planes of RANSAC
+_NUM_POINTS, _NUM_PLANES = 2000, 200  # points and sampled planes of RANSAC
 _LEAST_SHARE = 0.1  # share of points on a ground plane minus share of points below it
 
 
@@ -52,10 +52,10 @@ class HeightMap:
         The ground of a cell is the median over the clouds of the lowest points, without mirror
         images from below the road. A limit on the slope removes cars and walls.
         """
-        clouds = _drop_far_points(clouds)
-        low_m, shape = _grid_around(clouds)
-        cells = [_cells_of(points, low_m, shape[1]) for points in clouds]
-        heights = _median_of_lowest(clouds, cells, shape[0] * shape[1]).reshape(shape)
+        gridded = _drop_far_points(clouds)
+        low_m, shape = _grid_around(gridded)
+        cells = [_cells_of(points, low_m, shape[1]) for points in gridded]
+        heights = _median_of_lowest(gridded, cells, shape[0] * shape[1]).reshape(shape)
 
         is_measured = np.isfinite(heights)
         nearest_cell = tuple(
@@ -69,9 +69,10 @@ class HeightMap:
         is_pit = is_measured & (heights < median_m - rise_m * (_WINDOW // 2))
         heights = np.where(is_pit, median_m, heights)
 
+        # The hull is a lower bound of the ground, which is the mean of the points close to it.
         heights = _limit_slope(heights, rise_m)
         hull = HeightMap(_remove_humps(heights[nearest_cell]), low_m, CELL_M)
-        return HeightMap(_average_heights(hull, clouds, cells), low_m, CELL_M)
+        return HeightMap(_average_heights(hull, gridded, cells), low_m, CELL_M)
 
     def under(self, points: Float) -> Float:
         """Return (N,) ground heights, metres, at points (N,2 or 3); beyond the grid its edge's."""
@@ -130,8 +131,9 @@ def _median_of_lowest(clouds: Sequence[Float], cells: Sequence[Int], num_cells: 
         order = np.argsort(cell + scaled_height)
         first = np.flatnonzero(np.diff(cell[order], prepend=-1))  # lowest point of each cell
         num_points = np.diff(first, append=len(order))
-        num_stray = np.maximum(1, (_STRAY * num_points).astype(int))
-        ground_row = order[first + np.minimum(num_points - 1, num_stray)]
+        # The lowest points may be outliers; at least one is passed over, if the cell has two.
+        num_outliers = np.maximum(1, (_OUTLIER_SHARE * num_points).astype(int))
+        ground_row = order[first + np.minimum(num_points - 1, num_outliers)]
         cloud_lowest_m[cell[order[first]]] = z[ground_row]
     is_measured = ~np.isnan(lowest_m).all(axis=0)
     heights = np.full(num_cells, np.inf)
@@ -212,17 +214,17 @@ def _ground_normal(points: Float) -> Float | None:
     if len(points) < 3:
         return None
 
-    # planes through random triples of points
+    # Planes through random triples of points, with the normal upwards
     rng = np.random.default_rng(0)
     corner_a, corner_b, corner_c = points[
-        rng.integers(len(points), size=(_NUM_TRIES, 3))
+        rng.integers(len(points), size=(_NUM_PLANES, 3))
     ].transpose(1, 0, 2)
     normal = np.cross(corner_b - corner_a, corner_c - corner_a)
     normal *= np.where(normal[:, 2:] < 0, -1, 1)
     is_floor = normal[:, 2] > np.hypot(*normal[:, :2].T)  # a floor and not a wall
     normal = normal[is_floor] / np.linalg.norm(normal[is_floor], axis=1, keepdims=True)
 
-    # the plane with the most points on it and the fewest below, under the lidar
+    # The plane, under the lidar, with the most points on it and the fewest below
     plane_z_m = np.einsum("ij,ij->i", normal, corner_a[is_floor])
     height_m = points @ normal.T - plane_z_m
     on_plane = np.abs(height_m) < ABOVE_GROUND_M

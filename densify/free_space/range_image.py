@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""Build range images: the measurements of a sweep by direction, and its free space.
+"""Build range images, and find free-space violations: points that other sweeps saw through.
 
-A range image is in the scanner's frame at the firing time of each ray, where the rays form a
-regular grid of rings and azimuth steps (Thrun et al., "Probabilistic Robotics", 2005, ch. 9, for
-free space). A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell
-at several times, whose spread widens the margin. Several images with ever larger cells are used
-where enough of their cells are filled.
+A range image (`RangeImage`) holds the nearest return of a sweep in each direction. It is in the
+scanner's frame at the firing time of each ray, where the rays form a regular grid of rings and
+azimuth steps. The space before a return is free (Thrun et al., "Probabilistic Robotics", 2005, ch.
+9). A scanner that does not fire in order of azimuth (solid state, rosettes) faces a cell at several
+times, whose spread widens the margin. It gets several images with ever larger cells. `FreeSpace`
+holds the images of a window's sweeps, and tests points against them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,9 +32,16 @@ from densify.free_space.rays import (
     move_to_scanner,
     move_to_time,
 )
-from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep
+from densify.free_space.sensor import Sensors
+from densify.geometry import poses
+from densify.geometry.clock import Clock
+from densify.geometry.compiled import Kernel, inlined, num_threads
+from densify.geometry.types import Bool, Float, Float32, Int, RegisteredSweep, Stretch
 
+REACH_S = 1.0
+"""Greatest time between a sweep and the sweeps that are tested against its points."""
+FREE_MARGIN = 0.4, 0.015
+"""Least distance of a return beyond a seen-through point: the larger of metres, share of range."""
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
 _MIN_ROW_RAD = np.deg2rad(0.45)  # least height of a row for near points
 # Rings closer than this always share a row. Other rings have their own rows from the range at
@@ -39,14 +49,15 @@ _MIN_ROW_RAD = np.deg2rad(0.45)  # least height of a row for near points
 _MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
 # A ring this far from all others observes free space only at its rays. Three full cells suffice.
 _LONE_RAD = np.deg2rad(1.0)
-_SETTLED = 0.1  # two estimates of a firing time agree within this share of a turn
+_TIME_SHARE = 0.1  # two estimates of a firing time agree within this share of a turn
 _MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
-_DENSEST = 10  # percent of the returns of an unordered scanner that set its finest cells
-MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
+# Percentile of the ray spacings of an unordered scanner that is the size of its finest cells
+_FINEST_PERCENT = 10
+_MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
 # An unordered scanner gets larger cells, of up to `_MAX_SIZES` sizes, until this share of its
 # returns has enough filled cells.
-_VOUCHED, _MAX_SIZES = 0.8, 5
-_HIDES = 1000  # penalty of a hiding return, above the number of cells of all images added up
+_MIN_TESTABLE, _MAX_SIZES = 0.8, 5
+_PENALTY = 1000  # of a return that is not beyond the point; above the sum of all cells counted
 _PI, _ZERO = np.float32(np.pi), np.float32(0)  # float32, as all numbers in the kernels
 
 
@@ -59,7 +70,7 @@ class ScannerImage(NamedTuple):
     spread_s: Float32  # greatest difference from that time in seconds, same shape
     # Greatest difference between two estimates of the time at which a point is faced, if each
     # column has one time. A larger difference is at the seam between two turns.
-    settled_s: float
+    max_error_s: float
     # (R,C) float32 nearest return in the 3 x 3 cells around each cell, inf if none
     nearest_m: Float32
     num_filled: NDArray[np.uint8]  # (R,C) uint8 number of these nine cells with a return
@@ -97,7 +108,7 @@ class RangeImage:
         points: Float,
         margin_m: float,
         margin_fraction: float,
-        min_filled: int = MIN_FILLED,
+        min_filled: int = _MIN_FILLED,
         velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
         """Return (N,) True where the space at points (N,3) is certainly free.
@@ -154,6 +165,83 @@ class RangeImage:
         return num_beyond
 
 
+@dataclass(frozen=True)
+class FreeSpace:
+    """The free space that each of the W sweeps of a window observed; sweeps are 0 to W - 1.
+
+    Consecutive sweeps of a fast scanner, too sparse alone, are tested together as a batch.
+    """
+
+    images: tuple[RangeImage, ...]  # W range images
+    T_lidar_world: tuple[Float, ...]  # W transforms (4,4) at the reference times
+    clock: Clock  # reference times of the sweeps
+    sensors: Sensors  # scanners, with the angles between their rays
+    batches: tuple[tuple[int, ...], ...]  # indices of each batch's sweeps, see `Clock.batches`
+
+    @staticmethod
+    def of(stretch: Stretch) -> FreeSpace:
+        """Return the free space of a window of registered, deskewed sweeps."""
+        clock = Clock.of(stretch)
+        batches = clock.batches()
+        make_image = partial(RangeImage.of, num_together=max(map(len, batches)), by_ring=True)
+        with ThreadPoolExecutor(num_threads()) as pool:
+            images = tuple(pool.map(make_image, stretch.sweeps))
+        T_lidar_world = tuple(
+            poses.inverse(registered.T_world_lidar) for registered in stretch.sweeps
+        )
+        return FreeSpace(images, T_lidar_world, clock, Sensors.of(stretch.sweeps), batches)
+
+    def gap_m(self, position: Float, i: int) -> float:
+        """Return the metres between neighbouring rings of sweep i at a (3,) world position."""
+        position_lidar = poses.transform(self.T_lidar_world[i], position[None])
+        return float(self.sensors.finest_gap_m(position_lidar)[0])
+
+    def others(self, i: int) -> list[int]:
+        """Return the first sweep's index of each other batch within `REACH_S` of sweep i."""
+        return [
+            batch[0]
+            for batch in self.batches
+            if i not in batch and any(self.clock.near(i, j, REACH_S) for j in batch)
+        ]
+
+    @cached_property
+    def _batch_of(self) -> dict[int, tuple[int, ...]]:
+        """Indices of the sweeps in the same batch, by index of the sweep."""
+        return {j: batch for batch in self.batches for j in batch}
+
+    def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
+        """Return (N,) True where the batch of sweep j certainly observed free space.
+
+        Every return near the direction of the point must be clearly farther away, in all sweeps of
+        the batch. Together the sweeps must have enough returns there.
+
+        Args:
+            points: (N,3) positions in the world frame at the reference time of sweep j.
+            j: Index of the sweep.
+            velocity_m_s: (N,3) velocities in the world frame, None for static points.
+        """
+        batch = self._batch_of[j]
+        # Of several sweeps the sum must have enough filled cells, and not each of them.
+        min_filled = _MIN_FILLED if len(batch) == 1 else 1
+        counts = []  # one (S,N) array of `count_beyond` for each sweep of the batch
+        for k in batch:
+            T_lidar_world = self.T_lidar_world[k]
+            points_k = points
+            velocity_lidar = None
+            if velocity_m_s is not None:
+                velocity_lidar = poses.rotate(T_lidar_world, velocity_m_s)
+                if k != j:
+                    duration_s = self.clock.time_s[k] - self.clock.time_s[j]
+                    points_k = points + duration_s * velocity_m_s
+            points_lidar = poses.transform(T_lidar_world, points_k)
+            image = self.images[k]
+            counts.append(image.count_beyond(points_lidar, FREE_MARGIN, min_filled, velocity_lidar))
+        # A sweep that lacks a scanner has fewer images: its counts cannot be added to the others.
+        addable = [count for count in counts if len(count) == len(counts[0])]
+        is_free: Bool = (np.sum(addable, axis=0) >= _MIN_FILLED).any(axis=0)
+        return is_free
+
+
 class _Cells(NamedTuple):
     """The cells of one image, and the range in which it is used."""
 
@@ -181,7 +269,7 @@ def _scanner_images(
     rays = aim_rays(registered, lidar)
     images: list[ScannerImage] = []
     for cells in _choose_cells(rays, num_together, by_ring):
-        if cells.is_coarser and images and _share_vouched(images[-1], rays) >= _VOUCHED:
+        if cells.is_coarser and images and _share_testable(images[-1], rays) >= _MIN_TESTABLE:
             break  # still larger cells would call the gaps between posts free
         images.append(_make_image(registered, lidar, rays, cells))
     return images
@@ -201,8 +289,8 @@ def _make_image(
     np.minimum.at(nearest_m.reshape(-1), cell, rays.range_m[in_rows])
     num_filled = _join_3x3(np.add, np.isfinite(nearest_m).astype(np.uint8), 0)
     if cells.has_lone_rings:
-        num_filled[::2] *= 2  # three full cells of a single ring suffice
-        num_filled[1::2] = 0  # a cell between two single rings is no evidence
+        num_filled[::2] *= 2  # three filled cells of a lone ring count as six
+        num_filled[1::2] = 0  # a cell between two lone rings is no evidence
 
     if fires_by_azimuth(rays):
         offset_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
@@ -212,7 +300,7 @@ def _make_image(
     return ScannerImage(
         offset_s=times.offset_s,
         spread_s=times.spread_s,
-        settled_s=_SETTLED * float(np.ptp(rays.offset_s)),
+        max_error_s=_TIME_SHARE * float(np.ptp(rays.offset_s)),
         nearest_m=_join_3x3(np.minimum, nearest_m, np.inf),
         num_filled=num_filled,
         row_edges_rad=cells.row_edges_rad,
@@ -234,8 +322,8 @@ def _cell_of(rays: AimedRays, row_edges_rad: Float32, num_columns: int) -> tuple
 
 def _join_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> NDArray[Any]:
     """Join each of the (R,C) cells with its eight neighbours, ``empty`` outside; columns wrap."""
-    with_sides = join(join(np.roll(cells, 1, axis=1), cells), np.roll(cells, -1, axis=1))
-    padded = np.pad(with_sides, ((1, 1), (0, 0)), constant_values=empty)
+    in_row = join(join(np.roll(cells, 1, axis=1), cells), np.roll(cells, -1, axis=1))
+    padded = np.pad(in_row, ((1, 1), (0, 0)), constant_values=empty)
     return np.asarray(join(join(padded[:-2], padded[1:-1]), padded[2:]))
 
 
@@ -246,9 +334,8 @@ def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Floa
     with_rays = np.flatnonzero(num_rays)
     if not len(with_rays):
         return np.zeros(num_columns, np.float32)
-    known_s = sum_s[with_rays] / num_rays[with_rays]
-    mean_s = np.interp(np.arange(num_columns), with_rays, known_s)
-    return mean_s.astype(np.float32)
+    mean_s = sum_s[with_rays] / num_rays[with_rays]
+    return np.interp(np.arange(num_columns), with_rays, mean_s).astype(np.float32)
 
 
 def _times_per_cell(cell: Int, offset_s: Float32, shape: tuple[int, ...]) -> _Times:
@@ -266,15 +353,15 @@ def _times_per_cell(cell: Int, offset_s: Float32, shape: tuple[int, ...]) -> _Ti
     return _Times(offset_s=half * (first_s + last_s), spread_s=half * (last_s - first_s))
 
 
-def _share_vouched(image: ScannerImage, rays: AimedRays) -> float:
-    """Return the share of rays with enough filled cells around them."""
+def _share_testable(image: ScannerImage, rays: AimedRays) -> float:
+    """Return the share of the rays with enough filled cells of the image around them."""
     row, column = _cell_of(rays, image.row_edges_rad, image.num_filled.shape[1])
-    return float((image.num_filled[np.maximum(row, 0), column] >= MIN_FILLED).mean())
+    return float((image.num_filled[np.maximum(row, 0), column] >= _MIN_FILLED).mean())
 
 
 def _choose_cells(rays: AimedRays, num_together: int, by_ring: bool) -> list[_Cells]:
     """Choose the cells of one scanner's images, finest first; arguments as in `RangeImage.of`."""
-    if len(rays.azimuth) < FEW_POINTS:
+    if len(rays.azimuth) < FEW_POINTS:  # too few to measure their layout
         return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
     layout = measure_layout([rays])
     step_rad = layout.azimuth_step_rad / num_together
@@ -289,7 +376,7 @@ def _choose_cells(rays: AimedRays, num_together: int, by_ring: bool) -> list[_Ce
 def _cells_of_unordered(rays: AimedRays, layout: Layout) -> list[_Cells]:
     """Return square cells of several sizes, each twice as large as the one before."""
     gap_rad = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
-    finest_rad = _CELLS_PER_STEP * float(np.percentile(gap_rad, _DENSEST))
+    finest_rad = _CELLS_PER_STEP * float(np.percentile(gap_rad, _FINEST_PERCENT))
     # A step of azimuth is shorter on the sphere by the cosine of the elevation.
     shortening = float(np.cos(np.median(rays.elevation)))
     return [
@@ -301,14 +388,15 @@ def _cells_of_unordered(rays: AimedRays, layout: Layout) -> list[_Cells]:
 
 
 def _cells_of_rings(rings: Float, column_rad: float, by_ring: bool) -> list[_Cells]:
-    """Return cells whose rows reach half way to the neighbouring rings, and as far outwards."""
+    """Return the cells of a scanner with rings (K,), of a second image too if ``by_ring``."""
     borders = 0.5 * (rings[1:] + rings[:-1])
+    # The first and the last ring are in the middle of their rows.
     outer: Float = 2 * rings[[0, -1]] - borders[[0, -1]]
     edges: Float = np.concatenate([outer[:1], borders, outer[1:]])
     near_cells = _grid(_merge_rows(edges, _MIN_ROW_RAD), column_rad)
     far_edges = _merge_rows(edges, _MIN_FAR_ROW_RAD)
     if by_ring and len(near_cells.row_edges_rad) != len(far_edges):
-        # Three rings span about 1.5 of the lowest rows.
+        # A point's 3 x 3 cells reach 1.5 rows up and down: from this range on, more than the slack.
         far_m = _SLACK_M / (1.5 * float(np.diff(far_edges).min()))
         far_cells = _grid(far_edges, column_rad)
         return [near_cells._replace(to_m=far_m), far_cells._replace(from_m=far_m)]
@@ -330,7 +418,6 @@ def _grid(row_edges_rad: NDArray[np.floating], column_rad: float) -> _Cells:
 
 def _merge_rows(edges: Float, min_rad: float) -> Float:
     """Drop edges until rows have at least this height. The first and the last edge stay."""
-    # Dense rings share a row, because a slight error of registration moves points to another ring.
     merged = [edges[0]]
     for edge in edges[1:]:
         if edge - merged[-1] >= min_rad:
@@ -350,7 +437,7 @@ def _uniform_edges(elevation: Float32, row_rad: float) -> NDArray[np.floating]:
 @inlined
 def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
     """Return the column of an azimuth, 0 for NaN. Columns start behind the scanner."""
-    if not abs(azimuth) <= _PI:
+    if not abs(azimuth) <= _PI:  # True for NaN
         return np.int32(0)
     # 32 bits, because more of them fit into a vector instruction.
     column = np.int32((azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI)))
@@ -360,10 +447,10 @@ def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
 @inlined
 def _fill_rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
     """Fill ``row`` with the interval of the ascending edges of each elevation, -1 outside."""
-    # a binary search of many elevations at once, with the steps as the outer loop
+    # A binary search for many elevations at once. The inner loop, of equal steps, is vectorized.
     last, step = np.int32(len(edges) - 1), np.int32(1)
     row[:size] = 0
-    while 2 * step < last:
+    while 2 * step < last:  # to the largest power of 2 that is needed
         step *= np.int32(2)
     while step > 0:
         for k in range(size):
@@ -377,7 +464,8 @@ def _fill_rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
 
 @inlined
 def _speed_of(point, velocity, twist):  # type: ignore[no-untyped-def]
-    """Return the speed in m/s of a point relative to the lidar."""
+    """Return the speed in m/s of a point (3,) relative to the lidar with this twist (6,)."""
+    # The lidar's own velocity at the point is v + w x point.
     vx = velocity[0] - (twist[3] + twist[1] * point[2] - twist[2] * point[1])
     vy = velocity[1] - (twist[4] + twist[2] * point[0] - twist[0] * point[2])
     vz = velocity[2] - (twist[5] + twist[0] * point[1] - twist[1] * point[0])
@@ -386,12 +474,16 @@ def _speed_of(point, velocity, twist):  # type: ignore[no-untyped-def]
 
 @inlined
 def _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
-    """Fill position (scanner's frame), time, row and column at which the scanner faced points."""
+    """Find when and in which cell the scanner faced ``size`` points from index ``start`` on.
+
+    Fills in the position x, y, z in the scanner's frame at that time, the time, the elevation, and
+    the row (-1 outside the image) and column of the cell. ``velocity`` is (N,3), or (1,3) for all.
+    """
     # The time gives the position, the position gives the cell, and the cell gives the time. Two
-    # rounds from the position at the reference time converge; the third finds the last cell.
+    # iterations from the position at the reference time converge; the third finds the last cell.
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
     time_s[:size] = _ZERO
-    for round in range(3):
+    for iteration in range(3):
         for k in range(size):
             i, t = start + k, time_s[k]
             j = min(i, len(velocity) - 1)
@@ -402,20 +494,21 @@ def _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation
         move_to_scanner(x, y, z, size, image.origin_m, image.axes)
         for k in range(size):
             column[k] = _column(azimuth_of(x[k], y[k]), num_columns)
-        if round == 2 or not by_azimuth:
+        # Columns with one time need the row only in the end.
+        if iteration == 2 or not by_azimuth:
             for k in range(size):
                 elevation[k] = azimuth_of(np.sqrt(x[k] * x[k] + y[k] * y[k]), z[k])
             _fill_rows(elevation, size, image.row_edges_rad, row)
-        if round < 2:
+        if iteration < 2:
             for k in range(size):
                 time_s[k] = image.offset_s[0 if by_azimuth else max(row[k], 0), column[k]]
 
 
 @Kernel
 def _count_beyond(begin, end, points, velocity, image, margins, min_filled, num_beyond):  # type: ignore[no-untyped-def]
-    """Add to ``num_beyond`` (N,) the number of filled cells beyond each point, or -`_HIDES`."""
+    """Add to ``num_beyond`` (N,) one image's counts of `RangeImage.count_beyond`."""
     by_azimuth = len(image.offset_s) == 1
-    settled_s = np.float32(image.settled_s)
+    max_error_s = np.float32(image.max_error_s)
     x, y, z, time_s, elevation = np.empty((5, BLOCK), np.float32)
     row, column = np.empty((2, BLOCK), np.int32)
     # Each point needs a long chain of steps. A block of points takes every step in parallel.
@@ -430,11 +523,13 @@ def _count_beyond(begin, end, points, velocity, image, margins, min_filled, num_
             range_m = np.sqrt(horizontal_m * horizontal_m + z[k] * z[k])
             if range_m < image.from_m or range_m >= image.to_m:
                 continue
+
+            # The margin grows with the range and with the uncertainty of the firing time.
             margin_m = max(margins[0], margins[1] * range_m)
             error_s = abs(image.offset_s[0 if by_azimuth else r, c] - time_s[k])
             if by_azimuth:
-                # Between two turns a spinning scanner skips or repeats a sector.
-                if error_s > settled_s:
+                # Between two turns a spinning scanner skips or repeats a sector: no evidence.
+                if error_s > max_error_s:
                     continue
             else:
                 # Within the uncertain time the point may have moved.
@@ -442,7 +537,8 @@ def _count_beyond(begin, end, points, velocity, image, margins, min_filled, num_
                 twist = image.twists[0 if time_s[k] < _ZERO else 1]
                 speed_m_s = _speed_of(points[i], velocity[min(i, len(velocity) - 1)], twist)
                 margin_m += error_s * speed_m_s
+
             if image.nearest_m[r, c] > range_m + margin_m:
                 num_beyond[i] += image.num_filled[r, c]
             else:
-                num_beyond[i] -= _HIDES
+                num_beyond[i] -= _PENALTY

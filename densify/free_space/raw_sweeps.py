@@ -24,7 +24,8 @@ _CELL_RAD, _CELL_DEPTH = np.radians(2.0), 0.08  # size of a cell; depth as a sha
 _USUAL_POINTS = 120_000  # a cell has some 50 rays of a sweep of so many points
 _MIN_POINTS = 1000  # least number of points of a tested sweep
 _MAX_LONE = 5  # greatest number of returns in the cell of a lone return
-_MAX_ALONE = 0.007  # share of returns alone in a cell; real sweeps in good weather had up to 0.004
+# Greatest share of returns single in their cell in good weather; real sweeps had up to 0.004
+_MAX_SINGLE = 0.007
 
 _RAY_RAD = np.radians(0.4)  # side of a cell of direction in which returns occlude each other
 # A return is occluded if it is farther than the nearest return of its cell: share, metres.
@@ -33,10 +34,10 @@ _STEP_M, _NUM_STEPS = 4.0, 4  # first step of the search; number of steps, each 
 _MAX_MOVES = 20  # greatest number of moves with one step
 # Returns occluded from the scanner's position are fewer than this share of those occluded from any
 # other position.
-_LESS = 0.8
+_MAX_OCCLUDED_RATIO = 0.8
 # Up to this share of returns seems occluded from the scanner itself: silhouettes split beams.
 _AT_SILHOUETTES = 0.01
-_APART_M = 1.0  # least distance between the scanner's positions that shows its motion
+_MIN_MOTION_M = 1.0  # least distance between the scanner's positions that shows its motion
 _FLOOR_M = 30.0  # greatest distance of returns that show the floor
 _LOWEST_M, _ROOF_M = 0.5, 1.8  # heights above the floor: lowest scanner, scanner on a car's roof
 
@@ -59,7 +60,7 @@ def _cell_numbers(coordinates: Float) -> Int:
 # --- snow, rain and dust
 
 
-def without_lone(sweep: Sweep) -> Sweep:
+def remove_lone_returns(sweep: Sweep) -> Sweep:
     """Return the sweep without lone returns if their number suggests snow, rain or dust.
 
     The result counts them in ``num_lone``. The volume searched around a return grows with its range
@@ -70,16 +71,16 @@ def without_lone(sweep: Sweep) -> Sweep:
     if len(sweep) < _MIN_POINTS:
         return sweep
     coordinates = _cell_coordinates(sweep)
-    max_alone = _MAX_ALONE * len(sweep)
+    max_single = _MAX_SINGLE * len(sweep)
     num_in_cell = _count_in_cells(coordinates)
-    if np.count_nonzero(num_in_cell == 1) <= max_alone:
+    if np.count_nonzero(num_in_cell == 1) <= max_single:
         return sweep
     # The larger count of two grids, half a cell apart: a surface may lie on a cell border.
     shift = [[0.0], [0.5], [0.5], [0.5]]  # none between scanners
     num_in_cell = np.maximum(num_in_cell, _count_in_cells(coordinates + shift))
     is_lone = num_in_cell <= _MAX_LONE
     is_sparse = 2 * np.count_nonzero(is_lone) > len(sweep)
-    if np.count_nonzero(num_in_cell == 1) <= max_alone or is_sparse:
+    if np.count_nonzero(num_in_cell == 1) <= max_single or is_sparse:
         return sweep
     return replace(sweep.select(~is_lone), num_lone=int(is_lone.sum()))
 
@@ -165,7 +166,7 @@ def in_map_frame(
 
 def is_still(T_world_lidar: Float) -> bool:
     """Return True if the poses (n,4,4) of odometry hardly move, as between sweeps in a map."""
-    return bool(np.linalg.norm(np.ptp(T_world_lidar[:, :3, 3], axis=0)) <= _APART_M / 2)
+    return bool(np.linalg.norm(np.ptp(T_world_lidar[:, :3, 3], axis=0)) <= _MIN_MOTION_M / 2)
 
 
 def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
@@ -193,11 +194,11 @@ def way_in_map(first: Sweep, last: Sweep) -> float:
     """
     origin = _search_start(last)
     position_last = _find_scanner(last.points[::2], origin)
-    if np.linalg.norm(position_last - origin) < _APART_M:
+    if np.linalg.norm(position_last - origin) < _MIN_MOTION_M:
         return 0.0
     position_first = _find_scanner(first.points[::2], _search_start(first))
     distance_m = float(np.linalg.norm((position_last - position_first)[:2]))
-    return distance_m if distance_m > _APART_M else 0.0
+    return distance_m if distance_m > _MIN_MOTION_M else 0.0
 
 
 def share_behind(points: Float, origin: Float) -> float:
@@ -231,7 +232,7 @@ def _find_scanner(points: Float, start: Float) -> Float:
                 break
             best_position = positions[int(np.argmin(shares))]
             lowest_share = min(shares)
-    return best_position if lowest_share < _LESS * start_share else start
+    return best_position if lowest_share < _MAX_OCCLUDED_RATIO * start_share else start
 
 
 def _positions_around(position: Float, step_m: float, num: int) -> Float:
@@ -256,4 +257,4 @@ def _is_scanner(points: Float, position: Float, origin: Float) -> bool:
     """Return True if fewer points are occluded from the position than from origin and around."""
     other_positions = [origin, *_positions_around(position, _STEP_M, 4)]
     lowest_share = min(share_behind(points, other) for other in other_positions)
-    return share_behind(points, position) < _LESS * lowest_share
+    return share_behind(points, position) < _MAX_OCCLUDED_RATIO * lowest_share

@@ -49,12 +49,13 @@ _A1, _A3, _A5, _A7, _A9 = (
 def azimuth_of(x, y):  # type: ignore[no-untyped-def]
     """Return the azimuth of (x, y) in radians, positive to the left."""
     # The series is faster than the system's arctan2, and the same with every version of it.
+    # It holds up to 45 degrees; symmetries give the other octants.
     ax, ay = abs(x), abs(y)
-    steep = ay > ax
-    ratio = ax / ay if steep else (ay / ax if ax > _ZERO else _ZERO)
+    is_steep = ay > ax
+    ratio = ax / ay if is_steep else (ay / ax if ax > _ZERO else _ZERO)
     square = ratio * ratio
     angle = ratio * (_A1 + square * (_A3 + square * (_A5 + square * (_A7 + square * _A9))))
-    if steep:
+    if is_steep:
         angle = _HALF_PI - angle
     if x < _ZERO:
         angle = _PI - angle
@@ -64,11 +65,12 @@ def azimuth_of(x, y):  # type: ignore[no-untyped-def]
 @inlined
 def move_to_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
     """Move a point from the reference time to the lidar frame at ``time_s``: undo deskewing."""
-    # The rotation is taken to second order, because within a sweep it stays below 0.1 rad.
+    # The inverse rotation of p = point - translation is p - r x p + r x (r x p) / 2 to second order
+    # in the rotation vector r, which stays below 0.1 rad within a sweep.
     w = 0 if time_s < _ZERO else 1
     rx, ry, rz = twists[w, 0] * time_s, twists[w, 1] * time_s, twists[w, 2] * time_s
     px, py, pz = x - twists[w, 3] * time_s, y - twists[w, 4] * time_s, z - twists[w, 5] * time_s
-    tx, ty, tz = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px
+    tx, ty, tz = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px  # r x p
     return (
         px - tx + _HALF * (ry * tz - rz * ty),
         py - ty + _HALF * (rz * tx - rx * tz),
@@ -81,7 +83,7 @@ def move_to_scanner(x, y, z, size, origin, R):  # type: ignore[no-untyped-def]
     """Move ``size`` points from the lidar frame to the scanner's origin and axes R, in place."""
     for k in range(size):
         x[k], y[k], z[k] = x[k] - origin[0], y[k] - origin[1], z[k] - origin[2]
-    if R[0, 0] + R[1, 1] + R[2, 2] < 3:
+    if R[0, 0] + R[1, 1] + R[2, 2] < 3:  # not the identity
         for k in range(size):
             x[k], y[k], z[k] = (
                 R[0, 0] * x[k] + R[0, 1] * y[k] + R[0, 2] * z[k],
@@ -194,10 +196,10 @@ class Layout:
 def measure_layout(sweeps: Sequence[AimedRays]) -> Layout:
     """Return the layout of one scanner, measured in its rays of a few sweeps.
 
-    Lasers that do not share an origin, as in KITTI's HDL-64E, mix their rings at close range, but
-    their returns follow at even steps along the azimuth: lines. Scanners with neither rings nor
-    lines are unordered. Fewer than 200 returns give the default, lines with the spacing of a
-    64-beam scanner.
+    Most returns of rings have one of a few elevations. Lasers that do not share an origin, as in
+    KITTI's HDL-64E, mix their rings at close range, but their returns follow at even steps along
+    the azimuth: lines. Scanners with neither are unordered. Fewer than 200 returns give the
+    default, lines with the spacing of a 64-beam scanner.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
         return _default_layout()
@@ -252,20 +254,20 @@ def _nearest_ring(rings: Float, elevation: Float32) -> Int:
 def _find_peaks(counts: Float) -> Int:
     """Return the indices of maxima (ascending) with a valley of half their height between them."""
     peaks = []
-    top = bottom = 0  # indices of the highest count of this rise, and the lowest of this fall
-    rises = True
+    highest = lowest = 0  # indices of the highest count of this rise, and the lowest of this fall
+    is_rising = True
     for i, count in enumerate(counts.tolist()):
-        if rises and count > counts[top]:
-            top = i
-        elif rises and count < _VALLEY * counts[top]:
-            peaks.append(top)
-            bottom = i
-            rises = False
-        elif not rises and count < counts[bottom]:
-            bottom = i
-        elif not rises and _VALLEY * count > counts[bottom]:
-            top = i
-            rises = True
+        if is_rising and count > counts[highest]:
+            highest = i
+        elif is_rising and count < _VALLEY * counts[highest]:
+            peaks.append(highest)
+            lowest = i
+            is_rising = False
+        elif not is_rising and count < counts[lowest]:
+            lowest = i
+        elif not is_rising and _VALLEY * count > counts[lowest]:
+            highest = i
+            is_rising = True
     return np.array(peaks, np.int64)
 
 
@@ -279,11 +281,12 @@ def fires_by_azimuth(rays: AimedRays) -> bool:
     mean_s = np.bincount(column, rays.offset_s) / np.maximum(num_rays, 1)
     sum_squares = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
     spread_s = np.sqrt(sum_squares / np.maximum(num_rays, 1))[num_rays >= _MIN_PER_COLUMN]
+    # Most columns decide: at the seam between two turns a column has two times.
     return not len(spread_s) or bool(np.mean(spread_s < _AT_ONCE * duration_s) > 0.5)
 
 
 def _select_sectors(rays: AimedRays) -> AimedRays:
-    """Return every fourth sector of many rays, which is enough evidence."""
+    """Return every fourth sector of many rays, which is enough to measure a layout."""
     if len(rays.azimuth) > _MANY_POINTS:
         is_sampled = np.floor(rays.azimuth / _SECTOR_RAD) % 4 == 0
         if is_sampled.mean() > 0.1:  # a narrow view may miss these sectors
@@ -305,7 +308,7 @@ def _gaps_in_groups(group: NDArray[Any], angle: Float32) -> Float:
 def _step_on_rings(rays: AimedRays, rings: Float) -> float:
     """Return the median azimuth difference (rad) between neighbours on a ring."""
     gap_rad = _gaps_in_groups(_nearest_ring(rings, rays.elevation), rays.azimuth)
-    gap_rad = gap_rad[gap_rad > _RING_BIN_RAD]
+    gap_rad = gap_rad[gap_rad > _RING_BIN_RAD]  # not between two returns of one ray
     return float(np.median(gap_rad)) if len(gap_rad) else _DEFAULT_RAD[0]
 
 
@@ -322,10 +325,11 @@ def _even_step(rays: AimedRays) -> tuple[float, float]:
 
 def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
     """Return the table whose spacing at a ring is the mean distance to both neighbouring rings."""
-    low_rad = float(rings[0]) - _CELL_RAD
+    low_rad = float(rings[0]) - _CELL_RAD  # with a margin beyond the outermost rings
     num_bins = int((float(rings[-1]) + _CELL_RAD - low_rad) / _RING_BIN_RAD) + 1
     elevation = _bin_middles(low_rad, _RING_BIN_RAD, num_bins)
     gap_rad = np.interp(elevation, rings, np.gradient(rings, edge_order=1))
+    # A step of azimuth is shorter on the sphere by the cosine of the elevation.
     return RayTable.by_elevation(low_rad, _RING_BIN_RAD, step_rad * np.cos(elevation), gap_rad)
 
 
@@ -408,15 +412,16 @@ def _density_in_windows(num_returns: Float, cell_sr: Float) -> Float:
     density = np.zeros(num_returns.shape)
     # From the largest window, which always counts, to a single cell: smaller windows overwrite.
     for k in range(_NUM_WINDOWS, 0, -1):
-        num_in_window = _sum_in_windows(num_returns, 2**k - 1)
-        window_sr = _sum_in_windows(cell_sr, 2**k - 1)
+        side = 2**k - 1  # 31, 15, 7, 3, 1 cells
+        num_in_window = _sum_in_windows(num_returns, side)
+        window_sr = _sum_in_windows(cell_sr, side)
         is_enough = (num_in_window >= _MIN_NUM) | (k == _NUM_WINDOWS)
         window_density = num_in_window / np.maximum(window_sr, 1e-12)
         density = np.where(is_enough & (window_sr > 0), window_density, density)
     return density
 
 
-def _sum_in_windows(values: Float, cells: int) -> Float:
+def _sum_in_windows(values: Float, side: int) -> Float:
     """Return the sums of values (R,C) over square windows. The azimuth wraps around."""
-    mean: Float = ndimage.uniform_filter(values, cells, mode=("constant", "wrap"))
-    return mean * cells**2
+    mean: Float = ndimage.uniform_filter(values, side, mode=("constant", "wrap"))
+    return mean * side**2

@@ -45,16 +45,16 @@ class SensorModel(Layout):
         with_returns = [
             registered for registered in sweeps if (registered.sweep.lidar == lidar).any()
         ]
-        # the middle sweep of each third of them
+        # The middle sweep of each third of them
         middles = (np.arange(_NUM_SWEEPS) + 0.5) * len(with_returns) / _NUM_SWEEPS
-        chosen = [with_returns[index] for index in np.unique(middles.astype(int))]
-        sampled = [aim_rays(registered, lidar) for registered in chosen]
-        elevation = np.concatenate([rays.elevation for rays in sampled])
-        azimuth = np.concatenate([rays.azimuth for rays in sampled])
+        sampled = [with_returns[index] for index in np.unique(middles.astype(int))]
+        rays_of_sweep = [aim_rays(registered, lidar) for registered in sampled]
+        elevation = np.concatenate([rays.elevation for rays in rays_of_sweep])
+        azimuth = np.concatenate([rays.azimuth for rays in rays_of_sweep])
         return SensorModel(
-            **vars(measure_layout(sampled)),
-            origin_m=chosen[0].sweep.origin_m(lidar),
-            axes=chosen[0].sweep.axes(lidar),
+            **vars(measure_layout(rays_of_sweep)),
+            origin_m=sampled[0].sweep.origin_m(lidar),
+            axes=sampled[0].sweep.axes(lidar),
             elevation_rad=(float(elevation.min()), float(elevation.max())),
             azimuth_rad=_find_view(azimuth),
         )
@@ -67,7 +67,7 @@ class SensorModel(Layout):
         low_rad, bin_rad = self.table.low_rad, self.table.bin_rad
         row_of = self._rows_of_lines() if self.rings_rad is None else self._rows_of(self.rings_rad)
         num_columns = round(2 * np.pi / self.azimuth_step_rad)
-        # Rows are counted from 0. One more row is for directions above the last bin.
+        # The row at the last border, counted from 0, and one row for directions above it
         num_rows = int(row_of[-1]) + 2
         return RayGrid(low_rad, bin_rad, row_of, num_rows, num_columns)
 
@@ -95,17 +95,22 @@ class SensorModel(Layout):
         return rows
 
     def directions(self, points: Float) -> tuple[Float, Float, Float]:
-        """Return azimuth, elevation (rad), range (m), scanner axes, of points in lidar frame."""
+        """Return (N,) azimuth, elevation (rad, scanner's axes) and range (m) from the scanner.
+
+        ``points`` (N,3) are in the lidar frame.
+        """
         ray = points - self.origin_m
-        x, y, z = (ray if np.array_equal(self.axes, np.eye(3)) else ray @ self.axes.T).T
+        is_turned = not np.array_equal(self.axes, np.eye(3))
+        x, y, z = (ray @ self.axes.T if is_turned else ray).T
         horizontal_m = np.hypot(x, y)
         return np.arctan2(y, x), np.arctan2(z, horizontal_m), np.hypot(horizontal_m, z)
 
     def sees(self, azimuth: Float, elevation: Float) -> Bool:
         """Return (N,) True for directions, in radians, within the scanner's field of view."""
         right, left = self.azimuth_rad
+        # Both angles are counted to the left from the right end.
         in_view = (azimuth - right) % (2 * np.pi) <= (left - right) % (2 * np.pi)
-        if left - right >= 2 * np.pi:
+        if left - right >= 2 * np.pi:  # all round, where the width modulo 2 pi is 0
             in_view[:] = True
         low, high = self.elevation_rad
         return in_view & (elevation >= low) & (elevation <= high)
@@ -140,7 +145,7 @@ class Sensors:
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return the (N,) metres to the next ring of the points' scanners, lidar frame."""
+        """Return (N,) metres from points, lidar frame, to the next ring of their scanner (N,)."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             rows = np.flatnonzero(lidar == number)
@@ -148,18 +153,21 @@ class Sensors:
         return gap_m
 
     def finest_gap_m(self, points: Float) -> Float:
-        """Return (N,) metres, ring spacing of the scanner with the finest view of each point."""
+        """Return the least (N,) ring spacing of the scanners that have points (N,3) in view.
+
+        Points, in the lidar frame, that no scanner has in view get the largest spacing.
+        """
         gaps_m, in_view = zip(*(model.gap_m(points) for model in self.models.values()), strict=True)
         finest_m = np.where(in_view, gaps_m, np.inf).min(axis=0)
         return np.where(np.isfinite(finest_m), finest_m, np.max(gaps_m, axis=0))
 
 
 def _find_view(azimuth: Float32) -> tuple[float, float]:
-    """Return the right and the left end of the field of view, radians."""
+    """Return the right and the left end of the field of view, radians, of rays (N,)."""
     angles = np.unique(azimuth).astype(np.float64)
     gap_rad = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest = int(np.argmax(gap_rad))
-    if gap_rad[widest] < _HOLE_RAD:  # a building can cause it
+    if gap_rad[widest] < _HOLE_RAD:  # a building can cause it: the view is all round
         return -np.pi, np.pi
     # The view begins to the left of the widest gap, and ends at the gap's right side.
     return float(angles[(widest + 1) % len(angles)]), float(angles[widest])

@@ -29,14 +29,15 @@ from densify.config.errors import InputError
 from densify.geometry.types import Bool, Camera, Float, Float32
 
 NEAREST_M = 0.1
-"""Least depth of a visible point."""
+"""Least depth of a visible point, in metres."""
 # Possible numbers of coefficients of each model
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 _RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # all others are 0
 _NUM_ANGLES = 4096  # samples of a lens from which its inverse is interpolated
-_NUM_STEPS = 10  # greatest number of steps of Newton's method
-_STEP_RAD = np.cbrt(np.finfo(float).eps)  # step of differences with the least rounding error
-_CONVERGED = np.sqrt(np.finfo(float).eps)  # from here one more step of Newton's method is exact
+_NUM_ITERATIONS = 10  # greatest number of steps of Newton's method
+_STEP_RAD = np.cbrt(np.finfo(float).eps)  # step of central differences with the least error
+# Relative residual before the last step of Newton's method, which squares it: then it is exact.
+_CONVERGED = np.sqrt(np.finfo(float).eps)
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
@@ -92,7 +93,7 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
     normal = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     jacobian = np.zeros((len(ray), 2, 3))
-    # Central differences along two axes: along the ray nothing changes.
+    # Central differences along the two axes across each ray: along the ray nothing changes.
     for axis in (normal, np.cross(ray, normal)):
         uv_ahead = _pixels(camera, lens, ray + _STEP_RAD * axis)
         uv_behind = _pixels(camera, lens, ray + -_STEP_RAD * axis)
@@ -105,7 +106,7 @@ def depth_along(points_cam: Float, measure: str) -> Float:
     return points_cam[:, 2] if measure == "z" else np.linalg.norm(points_cam, axis=1)
 
 
-def converted(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
+def convert_depth(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
     """Return a depth map of a camera converted from one measure of depth to another.
 
     Pixels whose ray has z <= 0 become 0. If the measures are the same, the map is returned
@@ -215,26 +216,27 @@ def _plane(camera: Camera, points_cam: Float) -> tuple[Float, Float]:
     if camera.model == "mei":
         depth = z + camera.distortion[0] * np.linalg.norm(points_cam, axis=1)
         return x / depth, y / depth
-    from_axis = np.hypot(x, y)
+    off_axis = np.hypot(x, y)
     with np.errstate(invalid="ignore", divide="ignore"):
-        on_axis = np.where(z > 0, 1.0, np.nan)  # straight behind the lens the angle is undefined
-        stretch = np.where(from_axis > 0, np.arctan2(from_axis, z) / from_axis, on_axis)
-    return stretch * x, stretch * y
+        on_axis = np.where(z > 0, 1.0, np.nan)  # limit ahead; straight behind there is no direction
+        factor = np.where(off_axis > 0, np.arctan2(off_axis, z) / off_axis, on_axis)
+    return factor * x, factor * y
 
 
 def _direction(camera: Camera, x: Float, y: Float) -> Float:
     """Return (N,3) directions, of any length, from (N,) x and y on the plane; inverts `_plane`."""
     if camera.model == "pinhole":
         return np.column_stack([x, y, np.ones(len(x))])
-    squared = x**2 + y**2
+    squared_radius = x**2 + y**2
     if camera.model == "mei":
+        # The factor z + ξ of a unit vector: its length must be 1.
         xi = camera.distortion[0]
         with np.errstate(invalid="ignore"):
-            stretch = (xi + np.sqrt(1 + (1 - xi**2) * squared)) / (1 + squared)
-        return np.column_stack([stretch * x, stretch * y, stretch - xi])
-    angle = np.sqrt(squared)
-    stretch = np.sinc(angle / np.pi)
-    return np.column_stack([stretch * x, stretch * y, np.cos(angle)])
+            factor = (xi + np.sqrt(1 + (1 - xi**2) * squared_radius)) / (1 + squared_radius)
+        return np.column_stack([factor * x, factor * y, factor - xi])
+    angle = np.sqrt(squared_radius)
+    factor = np.sinc(angle / np.pi)  # sin(angle) / angle
+    return np.column_stack([factor * x, factor * y, np.cos(angle)])
 
 
 def _distort(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float]:
@@ -262,16 +264,16 @@ def _undistort(lens: _Lens, distorted: Float) -> Float:
     # plane of a lens with a half-space view is infinite.
     radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
     radius = radius[radius < 1e3]
-    table_distorted = radius * lens.numerator(radius**2) / lens.denominator(radius**2)
-    from_axis = np.hypot(*distorted.T)
+    distorted_radius = radius * lens.numerator(radius**2) / lens.denominator(radius**2)
+    target_radius = np.hypot(*distorted.T)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        start_radius = np.interp(from_axis, table_distorted, radius)
-        xy = distorted * np.where(from_axis > 0, start_radius / from_axis, 1.0)[:, None]
+        start_radius = np.interp(target_radius, distorted_radius, radius)
+        xy = distorted * np.where(target_radius > 0, start_radius / target_radius, 1.0)[:, None]
 
         # Newton's method, with the inverse of the symmetric 2 x 2 matrix of slopes
         unsolved = np.arange(len(distorted))
         error = np.full(len(distorted), np.inf)
-        for _ in range(_NUM_STEPS):
+        for _ in range(_NUM_ITERATIONS):
             residual = np.stack(_distort(lens, *xy[unsolved].T)) - distorted[unsolved].T
             slopes = _slopes_of(lens, *xy[unsolved].T)
             column_x = np.stack([slopes.y_by_y, -slopes.x_by_y])
@@ -279,7 +281,7 @@ def _undistort(lens: _Lens, distorted: Float) -> Float:
             determinant = slopes.x_by_x * slopes.y_by_y - slopes.x_by_y**2
             step = column_x * residual[0] + column_y * residual[1]
             xy[unsolved] -= (step / determinant).T
-            error[unsolved] = np.abs(residual).max(axis=0) / (1 + from_axis[unsolved])
+            error[unsolved] = np.abs(residual).max(axis=0) / (1 + target_radius[unsolved])
             unsolved = unsolved[~(error[unsolved] < _CONVERGED)]  # NaN stays unsolved
         is_solved = (error < _CONVERGED) & ((xy**2).sum(axis=1) < lens.limit)
     return np.where(is_solved[:, None], xy, np.nan)

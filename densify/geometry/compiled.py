@@ -95,7 +95,7 @@ def _is_open(folder: Path) -> bool:
     return open_folder is not None
 
 
-class _Kept(FunctionCache):
+class _DiskCache(FunctionCache):
     """Numba's cache of one function on disk. If it fails, the function is compiled in every run."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -128,7 +128,7 @@ class Kernel:
         self._function = function
         try:
             self._compiled = numba.njit(function, **_OPTIONS)
-            self._compiled._cache = _Kept(function)  # type: ignore[attr-defined]
+            self._compiled._cache = _DiskCache(function)  # type: ignore[attr-defined]
         except RuntimeError as error:  # no place for a cache
             self._do_without_cache(error)
             return

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 
-_SHARES = (0.9999, 0.999, 0.99)  # shares of the points that stay in a grid, tried in this order
+_BULK_SHARES = (0.9999, 0.999, 0.99)  # shares of the points that stay, tried in this order
 
 
 def tree_of(points: Float) -> cKDTree:
@@ -84,7 +84,7 @@ def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
     if not len(points) or _num_cells(points, cell) <= most_cells:
         return all_points
     distance = np.abs(points - np.median(points, axis=0)).max(axis=1)
-    for share in _SHARES:
+    for share in _BULK_SHARES:
         stays = distance <= np.quantile(distance, share)
         if _num_cells(points[stays], cell) <= most_cells:
             return stays
@@ -118,8 +118,8 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
     cells, cell_of_point = np.unique(cell, axis=0, return_inverse=True)
     cell_of_point = cell_of_point.ravel()
 
-    # Pairs of cells, the nearest first, because these link most points. Points of cells farther
-    # apart than (2, 2, 1), whose distance is 3, are farther apart than the distance.
+    # Pairs of cells, the nearest first, because these link most points. Points of cells (2, 2, 2)
+    # apart are at least the distance apart. Cells (2, 2, 1) apart have length 3.
     pairs = cKDTree(cells).query_pairs(3.0 + 1e-9, output_type="ndarray")
     num_apart = np.abs(cells[pairs[:, 0]] - cells[pairs[:, 1]]).sum(axis=1)
     nearest_first = pairs[np.argsort(num_apart, kind="stable")]

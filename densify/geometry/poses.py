@@ -68,7 +68,7 @@ def twist_to(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
     return twist_between(T_world_lidar[i - 1], T_world_lidar[i], seconds)
 
 
-def carried(T_a_b: Float, twist_b: Float) -> Float:
+def transform_twist(T_a_b: Float, twist_b: Float) -> Float:
     """Return twists (...,6) of frame b in frame a of the same rigid body, by the adjoint."""
     R_a_b = T_a_b[..., :3, :3]
     rotation = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., :3])

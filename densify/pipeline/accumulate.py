@@ -19,9 +19,9 @@ from densify.geometry.types import (
     Stretch,
 )
 
-_LEAST_SEEN = 3  # points of an object in one sweep; fewer do not determine its rotation
+_LEAST_POINTS = 3  # points of an object in one sweep; fewer do not determine its rotation
 _AXLE = 0.3  # from the middle of a vehicle to its rear axle, as a share of its length
-_BEYOND_PERCENT = 0.2  # percent of the points outside the object's box, on each side
+_OUTLIER_PERCENT = 0.2  # percent of the points outside the object's box, on each side
 
 
 def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_lost: bool) -> Cloud:
@@ -31,14 +31,16 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
     time. Static points keep their rigid positions, bit for bit.
 
     Args:
+        stretch: Registered, deskewed sweeps.
         fields: Flow of each sweep's points to the key sweep.
+        key: Frame number of the key sweep.
         drop_lost: Leave out moving points that cannot be followed to the key sweep, else they keep
             their rigid positions.
     """
-    sweep_rows = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
-    cloud = _empty_cloud(sum(map(len, sweep_rows)))
+    used_rows = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
+    cloud = _empty_cloud(sum(map(len, used_rows)))
     first = 0  # first row of the sweep in the cloud
-    for registered, flow, rows in zip(stretch.sweeps, fields, sweep_rows, strict=True):
+    for registered, flow, rows in zip(stretch.sweeps, fields, used_rows, strict=True):
         span = slice(first, first + len(rows))
         sweep = registered.sweep
         T_key_lidar = stretch.T_target_source(key, registered.frame)
@@ -52,6 +54,7 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         cloud.moving[span] = flow.moving[rows]
         cloud.instance[span] = flow.instance[rows]
 
+        # Moving points that are followed to the key sweep go where their flow leads.
         followed = np.flatnonzero((flow.moving & ~flow.lost)[rows])
         cloud_rows = first + followed
         flow_rows = rows[followed]
@@ -106,7 +109,7 @@ def object_tracks(
     return tuple(
         _fit_track(instance, objects[instance], key, stamps_ns)
         for instance in sorted(objects)
-        if max(len(seen.at_sweep) for seen in objects[instance].values()) >= _LEAST_SEEN
+        if max(len(points.at_sweep) for points in objects[instance].values()) >= _LEAST_POINTS
     )
 
 
@@ -122,7 +125,7 @@ def _collect_objects(
         T_key_lidar = stretch.T_target_source(key, registered.frame)
         instance = flow.instance[followed]
         points = registered.sweep.points[followed]
-        if flow.to_reference is not None:
+        if flow.to_reference is not None:  # from each point's own time to the sweep's
             points = points + flow.to_reference[followed]
         at_sweep = poses.transform(T_key_lidar, points)
         at_key = at_sweep + poses.rotate(T_key_lidar, flow.displacement[followed])
@@ -144,31 +147,32 @@ def _fit_track(
     """Return the track of an object from its points and the sweeps' reference times by frame."""
     # Motion of the object from the key to each sweep, in the key sweep's lidar frame.
     T_sweep_key = {
-        frame: poses.fit_rigid(seen.at_key, seen.at_sweep)
-        for frame, seen in by_frame.items()
-        if len(seen.at_sweep) >= _LEAST_SEEN
+        frame: poses.fit_rigid(points.at_key, points.at_sweep)
+        for frame, points in by_frame.items()
+        if len(points.at_sweep) >= _LEAST_POINTS
     }
     T_sweep_key[key] = np.eye(4)
     frames = sorted(T_sweep_key)
     duration_s = (stamps_ns[frames[-1]] - stamps_ns[frames[0]]) * 1e-9
-    velocity_m_s = np.median([seen.velocity_m_s for seen in by_frame.values()], axis=0)
-    points = np.concatenate([seen.at_key for seen in by_frame.values()])
+    velocity_m_s = np.median([points.velocity_m_s for points in by_frame.values()], axis=0)
+    points_key = np.concatenate([points.at_key for points in by_frame.values()])
     box = _fit_box(
-        points, velocity_m_s, T_sweep_key[frames[0]], T_sweep_key[frames[-1]], duration_s
+        points_key, velocity_m_s, T_sweep_key[frames[0]], T_sweep_key[frames[-1]], duration_s
     )
 
-    T = np.stack([T_sweep_key[frame] @ box.T_key_object for frame in frames])
+    T_key_object = np.stack([T_sweep_key[frame] @ box.T_key_object for frame in frames])
     stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
     velocities_m_s = velocity_m_s[None]
     if len(frames) > 1:
-        velocities_m_s = np.gradient(T[:, :3, 3], (stamp_ns - stamps_ns[key]) * 1e-9, axis=0)
+        since_key_s = (stamp_ns - stamps_ns[key]) * 1e-9
+        velocities_m_s = np.gradient(T_key_object[:, :3, 3], since_key_s, axis=0)
     num_points = [len(by_frame[frame].at_sweep) if frame in by_frame else 0 for frame in frames]
     return ObjectTrack(
         instance=instance,
         size_m=box.size_m,
         frames=tuple(frames),
         stamp_ns=stamp_ns,
-        T_key_object=T,
+        T_key_object=T_key_object,
         velocity_m_s=velocities_m_s,
         num_points=np.array(num_points, np.int64),
         seen_size_m=box.size_m,
@@ -185,23 +189,28 @@ class _Box(NamedTuple):
 def _fit_box(
     points: Float, velocity_m_s: Float, T_first_key: Float, T_last_key: Float, duration_s: float
 ) -> _Box:
-    """Return the box around points (N,3), key frame, whose x axis is along the motion."""
+    """Return the box around points (N,3), key frame, whose x axis is along the motion.
+
+    The motions (4,4) of the object from the key to its first and last sweep are in the key frame.
+    """
+    # Direction of the median point: its displacement by velocity or by pose, the longer one
     reference = np.median(points, axis=0)
     begin, end = (poses.transform(T, reference[None])[0] for T in (T_first_key, T_last_key))
     by_velocity = velocity_m_s * duration_s if duration_s else velocity_m_s
     direction = max(by_velocity, end - begin, key=lambda xyz: float(np.hypot(*xyz[:2])))
     yaw_first, yaw_last = (poses.log(T)[2] for T in (T_first_key, T_last_key))
-    # The second round takes the direction at the rear axle that the first round has found.
+    # A vehicle heads where its rear axle moves. The first iteration finds the axle.
     for _ in range(2):
         heading = np.arctan2(direction[1], direction[0])
         T_key_object = poses.exp(np.array([0, 0, heading, 0, 0, 0]))
         in_axes = poses.rotate(poses.inverse(T_key_object), points)
-        low, high = np.percentile(in_axes, [_BEYOND_PERCENT, 100 - _BEYOND_PERCENT], axis=0)
+        low, high = np.percentile(in_axes, [_OUTLIER_PERCENT, 100 - _OUTLIER_PERCENT], axis=0)
         if high[0] - low[0] < LONG_M:
             break
         axle = (low + high) / 2 - [_AXLE * (high[0] - low[0]), 0, 0]
         x, y, _ = T_key_object[:3, :3] @ axle - reference
         reference = reference + [x, y, 0]
+        # A turn moves the axle relative to the reference by angle times lever.
         direction = direction + (yaw_last - yaw_first) * np.array([-y, x, 0])
     T_key_object[:3, 3] = T_key_object[:3, :3] @ ((low + high) / 2)
     return _Box(T_key_object, high - low)

@@ -27,7 +27,7 @@ from densify.depth.views import HeldOut, SeenCloud, Views, with_ages
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Prior, Result, Stretch
 from densify.pipeline.process import Watch
-from densify.pipeline.recording import Beyond, Moment
+from densify.pipeline.recording import FarSurfaces, Moment
 from densify.registration.deskew import find_compensated
 from densify.scores import depth_metrics
 from densify.scores.cloud_scores import ghost_scores
@@ -87,7 +87,8 @@ class KeyScene(NamedTuple):
     settings: Config  # all settings
     key: int  # frame number of the key sweep
     stretch: Stretch  # registered sweeps of the key's window
-    beyond: Beyond | None  # static surfaces beyond the window; None if unknown or not requested
+    # Static surfaces beyond the window; None if unknown or not requested
+    far_surfaces: FarSurfaces | None
     key_image: RangeImage  # range image of the key sweep
     views: Views  # viewpoints of the depth maps
     images: Mapping[str, NDArray[np.uint8]]  # map name -> (H,W,3) RGB image that colours the cloud
@@ -125,34 +126,34 @@ def result_of_method(
         if output.movers != "keep":
             static = cloud.select(~cloud.moving & ~cloud.far)
             seen = views.see(static).with_far_points(far)
-        depth = _add_ages(scene, method, _make_maps(scene, seen, visible, filled))
+        depth_maps = _add_ages(scene, method, _make_maps(scene, seen, visible, filled))
     cloud = seen.cloud
     if scene.images:
         with watch.stage("colour"):
-            cloud = views.with_colours(seen, depth, scene.images)
+            cloud = views.with_colours(seen, depth_maps, scene.images)
     if visible:
-        cloud = views.with_confidence(seen, cloud, depth)
+        cloud = views.with_confidence(seen, cloud, depth_maps)
     with watch.stage("score"):
-        metrics = _score(scene, cloud, depth, visible) | {"held_out": held_out}
+        metrics = _score(scene, cloud, depth_maps, visible) | {"held_out": held_out}
     return Result(
         method=name,
         key=scene.key,
         frames=stretch.frames if method.all_sweeps else (scene.key,),
         cloud=cloud,
-        depth=depth,
+        depth=depth_maps,
         metrics=metrics,
         flow=flow,
         tracks=tracks,
         movers=movers,
-        optical_flow=views.optical_flow(cloud, depth) if output.optical_flow else {},
-        rejected=views.rejection_reasons(seen, depth) if output.rejected else {},
+        optical_flow=views.optical_flow(cloud, depth_maps) if output.optical_flow else {},
+        rejected=views.rejection_reasons(seen, depth_maps) if output.rejected else {},
         images=scene.images,
         stamp_ns=stretch[scene.key].sweep.stamp_ns,
         views=views.cameras(),
         truth_m={map_name: true_m for map_name, (true_m, _) in scene.truth.items()},
         T_key_lidar={frame: stretch.T_target_source(scene.key, frame) for frame in stretch.frames},
         far_frames=() if far is None else tuple(np.unique(far.cloud.frame).tolist()),
-        far_left_out=scene.beyond.standing.left_out if far and scene.beyond else (),
+        far_left_out=scene.far_surfaces.world.left_out if far and scene.far_surfaces else (),
     )
 
 
@@ -171,24 +172,24 @@ def _see_window(scene: KeyScene, cloud: Cloud, visible: bool) -> SeenCloud:
 
 def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
     """Return the static surfaces beyond the window as the cameras see them; None if not used."""
-    if not method.far or scene.beyond is None:
+    if not method.far or scene.far_surfaces is None:
         return None
     with scene.watch.stage("far"):
-        return scene.views.see_far(*scene.beyond, scene.stretch, standing_only=method.visible)
+        return scene.views.see_far(*scene.far_surfaces, scene.stretch, static_only=method.visible)
 
 
 def _add_ages(
-    scene: KeyScene, method: Method, depth: Mapping[str, DepthMap]
+    scene: KeyScene, method: Method, depth_maps: Mapping[str, DepthMap]
 ) -> dict[str, DepthMap]:
     """Return the maps with the time between the exposure and the source sweep of each pixel."""
     stamps_ns = {registered.frame: registered.sweep.stamp_ns for registered in scene.stretch.sweeps}
-    if method.far and scene.beyond is not None:
-        surfaces = scene.beyond.standing
+    if method.far and scene.far_surfaces is not None:
+        surfaces = scene.far_surfaces.world
         stamps_ns |= zip(surfaces.frames, surfaces.stamp_ns.tolist(), strict=True)
     exposures = scene.views.exposures
     return {
-        name: with_ages(maps, stamps_ns, scene.key, exposures[name].late_s)
-        for name, maps in depth.items()
+        name: with_ages(depth_map, stamps_ns, scene.key, exposures[name].late_s)
+        for name, depth_map in depth_maps.items()
     }
 
 
@@ -196,38 +197,40 @@ def _make_maps(
     scene: KeyScene, seen: SeenCloud, visible: bool, filled: bool
 ) -> dict[str, DepthMap]:
     """Return the depth maps of the points, limited to ``project.max_outliers``."""
-    depth = scene.views.depth_maps(seen, visible, filled)
+    depth_maps = scene.views.depth_maps(seen, visible, filled)
     if visible:
-        depth = _lower_confidence(scene, depth)
+        depth_maps = _lower_confidence(scene, depth_maps)
     max_outliers = scene.settings.project.max_outliers
-    return {name: with_max_outliers(maps, max_outliers) for name, maps in depth.items()}
+    return {
+        name: with_max_outliers(depth_map, max_outliers) for name, depth_map in depth_maps.items()
+    }
 
 
-def _lower_confidence(scene: KeyScene, depth: dict[str, DepthMap]) -> dict[str, DepthMap]:
+def _lower_confidence(scene: KeyScene, depth_maps: dict[str, DepthMap]) -> dict[str, DepthMap]:
     """Return the maps with a lower confidence for a single sweep, and for sweeps without times."""
     sweeps = [registered.sweep for registered in scene.stretch.sweeps]
+    if len(sweeps) == 1:
+        return {name: without_confirmation(depth_map) for name, depth_map in depth_maps.items()}
     key_sweep = scene.stretch[scene.key]
     untimed_share = np.mean([sweep.offset_ns is None for sweep in sweeps])
-    if len(sweeps) == 1:
-        return {name: without_confirmation(maps) for name, maps in depth.items()}
     if not untimed_share or not scene.settings.register.deskew:
-        return depth
+        return depth_maps
     period_s = float(np.median(np.diff([sweep.stamp_ns for sweep in sweeps]))) * 1e-9
     # Sweeps already compensated for motion need no point times.
     if key_sweep.sweep.offset_ns is None and (
         find_compensated(key_sweep.sweep, key_sweep.twist, period_s) is not None
     ):
-        return depth
-    # Without a time a point is shifted by up to the motion in half a period.
+        return depth_maps
+    # Without a time a point is shifted by up to the motion in half a period: forwards, twist[5].
     exposures = scene.views.exposures
     return {
         name: without_times(
-            maps,
+            depth_map,
             0.5 * period_s * abs(float(exposures[name].twist[5])),
             exposures[name].camera,
             float(untimed_share),
         )
-        for name, maps in depth.items()
+        for name, depth_map in depth_maps.items()
     }
 
 
@@ -240,7 +243,7 @@ def _score_held_out(scene: KeyScene, seen: SeenCloud, visible: bool) -> dict[str
 
 
 def _score(
-    scene: KeyScene, cloud: Cloud, depth: Mapping[str, DepthMap], visible: bool
+    scene: KeyScene, cloud: Cloud, depth_maps: Mapping[str, DepthMap], visible: bool
 ) -> dict[str, Any]:
     """Return the scores that need no ground truth, and depth scores if ground truth is given."""
     metrics: dict[str, Any] = {
@@ -248,31 +251,31 @@ def _score(
         "num_moving": int(cloud.moving.sum()),
         "density": {
             name: {
-                "measured": depth_metrics.image_density(maps.depth_m),
-                "filled": depth_metrics.image_density(maps.filled_m),
+                "measured": depth_metrics.image_density(depth_map.depth_m),
+                "filled": depth_metrics.image_density(depth_map.filled_m),
             }
-            for name, maps in depth.items()
+            for name, depth_map in depth_maps.items()
         },
         "ghosts": ghost_scores(cloud, scene.key_image, scene.key),
     }
     if scene.truth:
-        cameras = {name: scene.views.exposures[name].camera for name in depth}
+        cameras = {name: scene.views.exposures[name].camera for name in depth_maps}
         metrics["depth"] = {
-            name: depth_metrics.depth_scores(depth[name], *true, cameras[name])
+            name: depth_metrics.depth_scores(depth_maps[name], *true, cameras[name])
             for name, true in scene.truth.items()
         }
         metrics["reliability"] = {
-            name: reliability(depth[name], true_m, cameras[name])
+            name: reliability(depth_maps[name], true_m, cameras[name])
             for name, (true_m, _) in scene.truth.items()
         }
     if visible:
         metrics["expected_outliers"] = {
-            name: expected_outliers(maps) for name, maps in depth.items()
+            name: expected_outliers(depth_map) for name, depth_map in depth_maps.items()
         }
-    metrics["measure"] = {name: maps.measure for name, maps in depth.items()}
-    metrics["held_out"] = None  # its place; the scores come later
+    metrics["measure"] = {name: depth_map.measure for name, depth_map in depth_maps.items()}
+    metrics["held_out"] = None  # keeps the order of the file; the caller sets it
     if scene.settings.output.rejected:
-        metrics["rejected"] = {name: maps.counts() for name, maps in depth.items()}
+        metrics["rejected"] = {name: depth_map.counts() for name, depth_map in depth_maps.items()}
     return metrics
 
 

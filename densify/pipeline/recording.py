@@ -39,7 +39,7 @@ from densify.geometry.types import (
     Motion,
     ObjectTrack,
     RegisteredSweep,
-    StandingWorld,
+    StaticWorld,
     Stretch,
     StretchFlow,
     Sweep,
@@ -60,8 +60,9 @@ from densify.registration.trajectory import LeftOut, Registration, find_trajecto
 
 T = TypeVar("T")
 P = ParamSpec("P")
-_LEAD_IN_S = 0.5  # time before a window or a block, in which odometry settles
-_MIN_LEAD_IN = 2  # least number of sweeps in it, which show the speed
+# Time before a block, in which odometry converges to the vehicle's motion, and its least number of
+# sweeps, which show the speed
+_LEAD_IN_S, _MIN_LEAD_IN = 0.5, 2
 _STRIDE = 8  # every eighth point is enough for the share of points below the ground
 
 
@@ -94,10 +95,11 @@ class Piece:
 
     number: int  # index of the block
     row: int  # index of the piece in the block
-    # Poses of the piece's sweeps and of one before them, in the first's levelled lidar frame
+    # Poses of the piece's sweeps and, if there is one, of the sweep before them, in the world of
+    # the piece: the levelled lidar frame of the first of ``frames``
     poses: Trajectory
     frames: tuple[int, ...]  # frame numbers of the piece's sweeps
-    deskewed: dict[int, RegisteredSweep]  # its sweeps in its world, by frame, as they are needed
+    deskewed: dict[int, RegisteredSweep]  # by frame, those that were needed until now
 
     def pose(self, frame: int) -> Float:
         """Return the pose ``T_world_lidar`` (4,4) of a sweep in the world of the piece."""
@@ -113,11 +115,11 @@ class Moment(NamedTuple):
     tracks: tuple[ObjectTrack, ...]  # tracks of the moving objects
 
 
-class Beyond(NamedTuple):
+class FarSurfaces(NamedTuple):
     """The static surfaces beyond a key's window."""
 
-    standing: StandingWorld
-    T_key_standing: Float  # (4,4) pose of their world in the key frame
+    world: StaticWorld
+    T_key_world: Float  # (4,4) pose of that world in the key frame
 
 
 class Recording:
@@ -141,7 +143,8 @@ class Recording:
             keys: Frame numbers, around which sweeps are read; None for every frame.
             cache: Cache on disk for registration, motion and far; None for no cache.
             run: Name of a run whose processes share results through the cache; None for no sharing.
-            looks_around: True also searches motion ``flow.look_around_s`` beyond the windows.
+            looks_around: True searches motion also ``flow.look_around_s`` before and after the
+                windows, if the engine tracks objects over several keys.
 
         Raises:
             InputError: A key does not exist, or the window is invalid.
@@ -160,8 +163,9 @@ class Recording:
         looks_around &= engine_row(settings.flow.engine)[0].shared
         around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
         self.cut = Cut.of(timeline, window, keys, around_s)
+        # Around the windows motion is searched in every n-th sweep.
         self._step_around = max(1, timeline.num_in(step_s))
-        # The sweeps around a window count as lead-in, too.
+        # Odometry converges in the sweeps around a window, too: less lead-in is needed.
         self._num_lead_in = max(_MIN_LEAD_IN, timeline.num_in(_LEAD_IN_S - around_s))
 
         num_kept = max(map(len, self.cut.blocks), default=0) + self._num_lead_in
@@ -173,6 +177,7 @@ class Recording:
         """Return the seconds around windows where motion is searched, and between its sweeps."""
         if not keys or self.settings.flow.look_around_s == 0:
             return 0.0, 0.0
+        # The first readable key shows the number of points per second.
         for key in sorted(keys):
             with suppress(InputError):  # raised again where the key is made
                 num_points = len(self.sequence[key])
@@ -182,8 +187,9 @@ class Recording:
     def window_frames(self, key: int) -> WindowFrames:
         """Return the frames of a key's window, and the reasons if it is smaller than requested.
 
-        An UnplacedSweepError means that the key cannot be registered, a SweepError that none of its
-        neighbours can.
+        Raises:
+            SweepError: The key or all its neighbours cannot be registered.
+            InputError: The key's sweep cannot be read.
         """
         requested = self.timeline.window(key, self._num_beside)
         block_index = self.cut.number_of[key]
@@ -206,13 +212,10 @@ class Recording:
 
         # The key is alone because a neighbour failed to register. An unreadable neighbour is no
         # error: the recording may have lost it, and the key's own sweep gives a result.
-        unregistered = [
-            frame
-            for frame in requested.frames
-            if frame in left_out and not left_out[frame].unreadable
-        ]
-        if unregistered and len(window.frames) == 1:
-            raise left_out[unregistered[0]].error(unregistered[0])
+        if len(window.frames) == 1:
+            for frame in requested.frames:
+                if frame in left_out and not left_out[frame].unreadable:
+                    raise left_out[frame].error(frame)
         return window
 
     def window(self, key: int) -> Stretch:
@@ -220,44 +223,44 @@ class Recording:
         frames = self.window_frames(key).frames  # raises before a piece is looked up
         return self._stretch(self._piece(key), frames)
 
-    def around(self, key: int) -> Stretch:
-        """Return the registered sweeps, within and around a key's window, searched for motion."""
+    def searched(self, key: int) -> Stretch:
+        """Return the sweeps of a key's piece in which motion is searched, as `window`."""
         piece = self._piece(key)
-        return self._stretch(piece, self._searched(piece))
+        return self._stretch(piece, self._searched_frames(piece))
 
     def is_pair(self, key: int) -> bool:
         """Return True if motion of a key is searched in only two sweeps; a track needs three."""
-        return len(self._searched(self._piece(key))) == 2
+        return len(self._searched_frames(self._piece(key))) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
         """Return the scene flow of all points in a key's window; engine None or "": configured."""
         engine = engine or self.settings.flow.engine
         window = self.window(key)
         piece = self._piece(key)
-        # Two sweeps are too few for ``groups``.
+        # The engine ``groups`` tracks objects, which takes three sweeps.
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
             scene = Scene(window, self._ground(piece))
             return estimate_motion(scene, self.settings, engine)
-        # All poses, but points only for the sweeps of the window.
-        with_points = {registered.frame: registered for registered in window.sweeps}
+        # The poses of all searched sweeps, but points only for those of the window
+        in_window = {registered.frame: registered for registered in window.sweeps}
         sweeps = [
-            with_points.get(frame) or RegisteredSweep.without_points(piece.poses, frame)
-            for frame in self._searched(piece)
+            in_window.get(frame) or RegisteredSweep.without_points(piece.poses, frame)
+            for frame in self._searched_frames(piece)
         ]
         return self._motion(piece, engine).with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return the flow of a sweep to the next, else previous; without neighbours no steps."""
+        """Return the flow of a sweep to the next of its window, else to the first, else none."""
         window = self.window(frame)
         later = [other for other in window.frames if other > frame]
         earlier = [other for other in window.frames if other < frame]
         targets = later or earlier
         if not targets:
             return StretchFlow(window, {})
-        hop = (frame, targets[0])
-        return StretchFlow(window, {hop: self.motion(frame).flow(*hop)})
+        source_target = (frame, targets[0])
+        return StretchFlow(window, {source_target: self.motion(frame).flow(*source_target)})
 
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
@@ -287,6 +290,7 @@ class Recording:
             heights = self._ground(self._piece(key))
             tracks = complete_boxes(tracks, cloud, Rays(used, key), heights)
             is_below = heights.below(cloud.rigid_points, stretch[key].T_world_lidar)
+            # Points below the ground are mirror images of a wet road, or noise.
             return Moment(cloud.select(~is_below) if is_below.any() else cloud, flow, tracks)
 
     def share_below(self, key: int) -> float:
@@ -298,13 +302,13 @@ class Recording:
         ]
         return float(np.concatenate(is_below).mean())
 
-    def find_beyond(self, key: int) -> Beyond | None:
+    def find_far_surfaces(self, key: int) -> FarSurfaces | None:
         """Return the static surfaces beyond the key's window; None without ``far_m`` or sweeps."""
         if not self.settings.accumulate.far_m:
             return None
         piece = self._piece(key)
         surfaces = self._far(piece)
-        return Beyond(surfaces, poses.inverse(piece.pose(key))) if surfaces.frames else None
+        return FarSurfaces(surfaces, poses.inverse(piece.pose(key))) if surfaces.frames else None
 
     def _piece(self, key: int) -> Piece:
         """Return the piece that holds the key sweep."""
@@ -314,7 +318,7 @@ class Recording:
     @_latest
     def registration(self, number: int) -> Registration:
         """Register each run of consecutive sweeps of a block, split at sweeps that are left out."""
-        frames = self._registered_together(number)
+        frames = self._frames_with_lead_in(number)
 
         def make() -> Registration:
             self.sweeps.prepare(frames)
@@ -329,7 +333,8 @@ class Recording:
                     # Without the sweep that failed, the rest is tried again.
                     is_unfit = isinstance(error, UnfitSweepError)
                     left_out[error.frame] = LeftOut(str(error), unreadable=False, unfit=is_unfit)
-                    remaining += self.timeline.runs([f for f in run if f != error.frame])
+                    others = [frame for frame in run if frame != error.frame]
+                    remaining += self.timeline.runs(others)
             in_order = sorted(pieces, key=lambda piece: piece.frames)
             return Registration(tuple(in_order), left_out)
 
@@ -364,24 +369,24 @@ class Recording:
             )
         return trajectory
 
-    def _registered_together(self, number: int) -> list[int]:
-        """Return the frames of a block's lead-in, then of the block."""
+    def _frames_with_lead_in(self, number: int) -> list[int]:
+        """Return the frames of a block's lead-in, then of the block: all that registration uses."""
         block = self.cut.blocks[number]
         return [*self.timeline.before(block[0], self._num_lead_in), *block]
 
     @_latest
     def _pieces(self, number: int) -> list[Piece]:
-        """Return the pieces of a block, with their poses."""
+        """Return the pieces of a block, with their poses, without the lead-in."""
         block = frozenset(self.cut.blocks[number])
         # The sweep before the block tells the twist of the block's first sweep.
         with_pose = block.union(self.timeline.before(self.cut.blocks[number][0], 1))
         pieces = list[Piece]()
-        for registered in self.registration(number).pieces:
-            frames = tuple(frame for frame in registered.frames if frame in block)
+        for trajectory in self.registration(number).pieces:
+            frames = tuple(frame for frame in trajectory.frames if frame in block)
             if frames:
-                part = [frame for frame in registered.frames if frame in with_pose]
-                trajectory = registered.part(part, origin=frames[0])
-                pieces.append(Piece(number, len(pieces), trajectory, frames, {}))
+                part = [frame for frame in trajectory.frames if frame in with_pose]
+                piece_poses = trajectory.part(part, origin=frames[0])
+                pieces.append(Piece(number, len(pieces), piece_poses, frames, {}))
         return pieces
 
     def _stretch(self, piece: Piece, frames: Sequence[int]) -> Stretch:
@@ -394,30 +399,30 @@ class Recording:
         return Stretch(tuple(piece.deskewed[frame] for frame in frames))
 
     @_latest
-    def _searched(self, piece: Piece) -> tuple[int, ...]:
+    def _searched_frames(self, piece: Piece) -> tuple[int, ...]:
         """Return the frames of a piece where motion is searched: windows, and every n-th around."""
         frames = piece.frames
         in_windows = self._in_windows(piece.number)
         window_rows = np.flatnonzero([frame in in_windows for frame in frames])
         if self._step_around == 1 or not len(window_rows):
             return frames
-        # Sweeps from the nearest sweep of a window: 0 within it, every n-th around it.
+        # Number of sweeps to the nearest window, 0 within it
         num_away = np.abs(np.arange(len(frames))[:, None] - window_rows).min(axis=1)
         is_searched = num_away % self._step_around == 0
-        return tuple(frame for frame, used in zip(frames, is_searched, strict=True) if used)
+        return tuple(np.array(frames)[is_searched].tolist())
 
     @_latest
     def _ground(self, piece: Piece) -> HeightMap:
         """Return the height map of the ground of a piece."""
-        stretch = self._stretch(piece, self._searched(piece))
+        stretch = self._stretch(piece, self._searched_frames(piece))
         with self._watch.stage("ground"):
             return ground(stretch)
 
     @_latest
     def _motion(self, piece: Piece, engine: str) -> SharedMotion:
         """Return the scene flow in a piece, without the sweeps to keep the cache small."""
-        asked = self._in_windows(piece.number)
-        frames = self._searched(piece)
+        asked = self._in_windows(piece.number)  # the frames whose flow may be asked for
+        frames = self._searched_frames(piece)
 
         def make() -> SharedMotion:
             stretch = self._stretch(piece, frames)
@@ -428,16 +433,16 @@ class Recording:
             return cast(SharedMotion, motion).with_stretch(Stretch(()))
 
         settings = [engine, self.settings.flow, self.settings.objective, sorted(asked), piece.row]
-        return self._cached("motion", self._registered_together(piece.number), make, settings)
+        return self._cached("motion", self._frames_with_lead_in(piece.number), make, settings)
 
     @_latest
-    def _far(self, piece: Piece) -> StandingWorld:
+    def _far(self, piece: Piece) -> StaticWorld:
         """Return the static surfaces along the road of a piece, in the piece's world."""
         # Sweeps of the block outside the windows belong to the far range.
         in_windows = self._in_windows(piece.number)
         frames = tuple(frame for frame in piece.frames if frame in in_windows) or piece.frames
 
-        def make() -> StandingWorld:
+        def make() -> StaticWorld:
             keys = [key for key in self.cut.keys_of(piece.number) if key in frames]
             window = self._stretch(piece, frames)
             with self._watch.stage("far"):

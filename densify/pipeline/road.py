@@ -21,7 +21,7 @@ from densify.geometry.types import (
     Camera,
     Float,
     RegisteredSweep,
-    StandingWorld,
+    StaticWorld,
     Stretch,
     Trajectory,
 )
@@ -32,11 +32,15 @@ from densify.registration.deskew import deskew_sweep, twists
 from densify.registration.road_poses import follow_road, num_in_submap, relax_poses
 
 _STEP_M = 2.0  # usual distance along the road between the sweeps that are used
-_MIN_STEP_M = 0.5 * _STEP_M  # least distance between them
+_MIN_STEP_M = 0.5 * _STEP_M  # least distance between them: sweeps do not lie at exact steps
 _MAX_S = 15.0  # greatest time on each side; a parked vehicle observes nothing new
-_SAME_VIEW_M = 3.0  # keys closer than this share a view
-_UNSEEN_SHARE = 0.5  # of far_m where no camera looks: those sweeps are farther from what is seen
-_SLACK_M = 4.0  # motion of a lidar within a sweep, and of a camera until its exposure
+_SAME_VIEW_M = 3.0  # distance between keys up to which they share a view
+_UNSEEN_SHARE = (
+    0.5  # of ``far_m``, used where no camera looks: farther sweeps measure little in view
+)
+# Greatest distance of a camera from its pose in the test of the view: the motion of a fast vehicle
+# within a sweep and until the exposure
+_SLACK_M = 4.0
 
 
 class _RoadSweep(NamedTuple):
@@ -47,7 +51,7 @@ class _RoadSweep(NamedTuple):
     # Surface of all returns, deskewed, in the lidar frame; None with recorded poses
     surface: Surface | None
     travel_m: float  # distance along the road from the window's first sweep, negative before it
-    in_window: bool  # true if the sweep is in the window, where poses are known
+    in_window: bool  # true if the sweep is in the window, whose poses are fixed
 
     def deskewed(self) -> RegisteredSweep:
         """Return the returns in view of a camera, deskewed."""
@@ -70,25 +74,27 @@ class _RelaxedRoad(NamedTuple):
 
 @dataclass(frozen=True)
 class Road:
-    """The road before and after a window."""
+    """The road before (side -1) and after (side 1) a window."""
 
     timeline: Timeline  # times of the recording's sweeps
     sweeps: Sweeps  # reader of the raw sweeps
     settings: RegisterSettings  # settings of registration
-    # Distance along the road on each side of the window where a camera looks. Half of it is covered
-    # where no camera looks.
+    # Length of road that is used on each side of the window where a camera looks, and half of it
+    # where none looks
     far_m: float
     window: Stretch  # deskewed sweeps of the window
     views: Sequence[tuple[Camera, Float]]  # cameras with their poses ``T_cam_world`` (4,4)
 
-    def find_static_surfaces(self, with_window: bool) -> StandingWorld:
+    def find_static_surfaces(self, with_window: bool) -> StaticWorld:
         """Return the static surfaces along the road, in the world of the window.
 
-        Only points that one of the views may see are kept.
+        The result has the points that one of the views may see and that no other sweep along the
+        road saw through. ``left_out`` names the sweeps whose poses are unreliable.
 
         Args:
             with_window: Include the points of the window's own sweeps.
         """
+        # Collect and register the sweeps, in the order of the road.
         window_sweeps = self._thin_window()
         with ThreadPoolExecutor(num_threads()) as pool:
             sweeps_before, sweeps_after = pool.map(self._collect_side, (-1, 1))
@@ -98,6 +104,7 @@ class Road:
         if has_odometry and len(road.sweeps) > 1:
             road = self._relax(road.sweeps)
 
+        # Keep the points of each sweep that no other sweep saw through.
         used = [
             road_sweep
             for road_sweep in road.sweeps
@@ -108,8 +115,8 @@ class Road:
         static_points = partial(far.static_points, Sensors.of(self.window.sweeps))
         with ThreadPoolExecutor(num_threads()) as pool:
             deskewed = list(pool.map(_RoadSweep.deskewed, used))
-            seen_through = far.find_seen_through(deskewed, travel_m)
-            static_surfaces = list(pool.map(static_points, deskewed, seen_through))
+            is_seen_through = far.find_seen_through(deskewed, travel_m)
+            static_surfaces = list(pool.map(static_points, deskewed, is_seen_through))
         left_out = tuple(sorted(road.unreliable))
         return replace(far.join_worlds(static_surfaces), left_out=left_out)
 
@@ -125,14 +132,15 @@ class Road:
 
     @cached_property
     def _travel_m(self) -> Float:
-        """The (n,) distances along the road, from the first sweep of the window to each."""
+        """The (W,) metres travelled from the window's first sweep to each of its W sweeps."""
         positions = np.stack([registered.T_world_lidar[:3, 3] for registered in self.window.sweeps])
-        return np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
+        step_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        return np.append(0.0, step_m.cumsum())
 
     def _thin_window(self) -> list[_RoadSweep]:
-        """Return the window's sweeps, thinned to at least 1 m between sweeps."""
+        """Return the window's sweeps, thinned to at least 1 m of travel between two of them."""
         road_sweeps = list[_RoadSweep]()
-        last_used_m = -np.inf
+        last_used_m = -np.inf  # the first sweep is used
         for registered, travel_m in zip(self.window.sweeps, self._travel_m.tolist(), strict=True):
             if travel_m - last_used_m >= _MIN_STEP_M:
                 last_used_m = travel_m
@@ -142,27 +150,29 @@ class Road:
         return road_sweeps
 
     def _collect_side(self, side: int) -> list[_RoadSweep]:
-        """Return the sweeps before (side -1) or after (side 1) the window, nearest first."""
+        """Return the sweeps of one side of the window, nearest first, at least 1 m apart."""
         end_of_window = self.window.sweeps[0 if side < 0 else -1]
-        begin_m = 0.0 if side < 0 else self._travel_m[-1]
-        reach_m = self.far_m if self._is_seen(side) else _UNSEEN_SHARE * self.far_m
+        end_travel_m = 0.0 if side < 0 else self._travel_m[-1]
+        reach_m = self.far_m if self._may_see_end(side) else _UNSEEN_SHARE * self.far_m
         road_sweeps = list[_RoadSweep]()
-        position = end_of_window.T_world_lidar[:3, 3]
-        last_used_m = travel_m = 0.0  # both from the end of the window
+        last_position = end_of_window.T_world_lidar[:3, 3]
+        from_window_m = 0.0  # travel from the end of the window to the sweep
+        last_used_m = 0.0  # the same of the last sweep that is used
         for registered, surface in self._register_side(side, reach_m):
-            travel_m += float(np.linalg.norm(registered.T_world_lidar[:3, 3] - position))
             position = registered.T_world_lidar[:3, 3]
-            if travel_m - last_used_m < _MIN_STEP_M:
+            from_window_m += float(np.linalg.norm(position - last_position))
+            last_position = position
+            if from_window_m - last_used_m < _MIN_STEP_M:
                 continue
-            last_used_m = travel_m
+            last_used_m = from_window_m
             in_view = self._select_in_view(registered)
-            road_m = begin_m + side * travel_m
-            road_sweeps.append(_RoadSweep(in_view, surface, road_m, in_window=False))
+            travel_m = end_travel_m + side * from_window_m
+            road_sweeps.append(_RoadSweep(in_view, surface, travel_m, in_window=False))
         return road_sweeps
 
-    def _is_seen(self, side: int) -> bool:
-        """Return True if a camera may see the road's end before (side -1) or after the window."""
-        first, last = (self.window.sweeps[row].T_world_lidar[:3, 3] for row in (0, -1))
+    def _may_see_end(self, side: int) -> bool:
+        """Return True if a camera may see the road's end on one side, taken as straight."""
+        first, last = (self.window.sweeps[index].T_world_lidar[:3, 3] for index in (0, -1))
         length_m = float(np.linalg.norm(last - first))
         if length_m < _MIN_STEP_M:  # at rest the direction of the road is unknown
             return True
@@ -173,8 +183,10 @@ class Road:
     def _register_side(
         self, side: int, reach_m: float
     ) -> Iterator[tuple[RegisteredSweep, Surface | None]]:
-        """Yield each raw sweep before or after the window, with its surface, nearest first."""
-        window_sweeps = self.window.sweeps[::side]  # the last one is at the end of the window
+        """Yield the raw sweeps of one side up to ``reach_m`` of travel, with their surfaces."""
+        # Side -1 reverses time: the last window sweep is at the end of the window from which the
+        # road is followed, and the frames come nearest first.
+        window_sweeps = self.window.sweeps[::side]
         end_of_window = window_sweeps[-1]
         frames_beside = self.timeline.before if side < 0 else self.timeline.after
         frames = frames_beside(end_of_window.frame, self._max_sweeps(reach_m))[::side]
@@ -187,13 +199,14 @@ class Road:
         )
 
     def _max_sweeps(self, reach_m: float) -> int:
-        """Return the number of sweeps that cover a distance at half the speed of the window."""
+        """Return the number of sweeps after which a side ends even if it is shorter than reach."""
         first, last = self.window.sweeps[0], self.window.sweeps[-1]
         max_s = _MAX_S
         duration_ns = last.sweep.stamp_ns - first.sweep.stamp_ns
         if duration_ns > 0:
             travel = last.T_world_lidar[:3, 3] - first.T_world_lidar[:3, 3]
             speed_m_s = float(np.linalg.norm(travel)) / (1e-9 * duration_ns)
+            # Outside the window the vehicle may be half as fast.
             max_s = min(max_s, 2 * reach_m / max(speed_m_s, 1e-3))
         return int(max_s * 1e9 / self.timeline.period_ns)
 
@@ -201,33 +214,38 @@ class Road:
         self, end_of_window: RegisteredSweep, frames: Sequence[int], reach_m: float
     ) -> Iterator[tuple[RegisteredSweep, None]]:
         """Yield the sweeps of `_register_side` at the recording's own poses."""
-        travel_m = last_used_m = 0.0
-        T_last = end_of_window.T_world_lidar
+        from_window_m = last_used_m = 0.0  # travel as in `_collect_side`
+        T_world_last = end_of_window.T_world_lidar
         last_ns = end_of_window.sweep.stamp_ns
         try:
+            # The recording has a world of its own.
             recorded_pose = self._recorded_pose(end_of_window.frame)
-            T_world_recorded = T_last @ poses.inverse(recorded_pose)
+            T_world_recorded = T_world_last @ poses.inverse(recorded_pose)
             for frame in frames:
-                T = T_world_recorded @ self._recorded_pose(frame)
+                T_world_lidar = T_world_recorded @ self._recorded_pose(frame)
                 stamp_ns = self.timeline.stamp_of(frame)
-                twist = poses.twist_between(T_last, T, (stamp_ns - last_ns) * 1e-9)
-                travel_m += float(np.linalg.norm(T[:3, 3] - T_last[:3, 3]))
-                T_last = T
+                # Back in time both motion and seconds are reversed: the velocity is the same.
+                seconds = (stamp_ns - last_ns) * 1e-9
+                twist = poses.twist_between(T_world_last, T_world_lidar, seconds)
+                step = T_world_lidar[:3, 3] - T_world_last[:3, 3]
+                from_window_m += float(np.linalg.norm(step))
+                T_world_last = T_world_lidar
                 last_ns = stamp_ns
-                if travel_m > reach_m:
+                if from_window_m > reach_m:
                     return
-                if travel_m - last_used_m >= _MIN_STEP_M:
-                    last_used_m = travel_m
-                    yield RegisteredSweep(self.sweeps.read(frame), T, twist, twist), None
+                if from_window_m - last_used_m >= _MIN_STEP_M:
+                    last_used_m = from_window_m
+                    sweep = self.sweeps.read(frame)
+                    yield RegisteredSweep(sweep, T_world_lidar, twist, twist), None
         except InputError:  # the road ends without a pose or a sweep
             return
 
     def _recorded_pose(self, frame: int) -> Float:
         """Return the recorded ``T_world_lidar`` (4,4) of a sweep; raise InputError without one."""
-        return cast(Float, self.sweeps.recorded_pose(frame))
+        return cast(Float, self.sweeps.recorded_pose(frame))  # None only without recorded poses
 
     def _relax(self, road_sweeps: Sequence[_RoadSweep]) -> _RelaxedRoad:
-        """Return the sweeps with poses corrected by `relax_poses`."""
+        """Return the sweeps with poses corrected by `relax_poses`; those of the window stay."""
         frames = tuple(road_sweep.registered.frame for road_sweep in road_sweeps)
         num_points = float(np.median([len(registered.sweep) for registered in self.window.sweeps]))
         relaxed = relax_poses(
@@ -240,17 +258,14 @@ class Road:
         stamp_ns = np.array(stamps_ns, np.int64)
         trajectory = Trajectory(frames, stamp_ns, relaxed.T_world_lidar)
 
-        corrected = list[_RoadSweep]()
+        # The twists that deskew a sweep follow from the corrected poses around it.
+        corrected = list(road_sweeps)
         for i, road_sweep in enumerate(road_sweeps):
-            if not road_sweep.in_window:  # poses of the window stay
-                T = relaxed.T_world_lidar[i]
-                sweep = road_sweep.registered.sweep
-                registered = RegisteredSweep(sweep, T, *twists(trajectory, i))
-                road_sweep = road_sweep._replace(registered=registered)
-            corrected.append(road_sweep)
-        unreliable = (
-            frame for frame, holds in zip(frames, relaxed.is_reliable, strict=True) if not holds
-        )
+            if not road_sweep.in_window:
+                sweep, T_world_lidar = road_sweep.registered.sweep, relaxed.T_world_lidar[i]
+                registered = RegisteredSweep(sweep, T_world_lidar, *twists(trajectory, i))
+                corrected[i] = road_sweep._replace(registered=registered)
+        unreliable = np.array(frames)[~relaxed.is_reliable].tolist()
         return _RelaxedRoad(corrected, frozenset(unreliable))
 
     def _select_in_view(self, registered: RegisteredSweep) -> RegisteredSweep:
@@ -258,12 +273,12 @@ class Road:
         sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
         in_view = np.zeros(len(sweep), bool)
         # Each view tests only the returns that no view before it may see.
-        rows = np.flatnonzero(far.in_reach(sweep))
-        points = sweep.points[rows].astype(np.float32)
+        untested_rows = np.flatnonzero(far.in_reach(sweep))
+        points = sweep.points[untested_rows].astype(np.float32)
         for camera, T_cam_world in self.views:
             may_see = far.may_see(camera, T_cam_world @ T_world_lidar, points, _SLACK_M)
-            in_view[rows[may_see]] = True
-            rows = rows[~may_see]
+            in_view[untested_rows[may_see]] = True
+            untested_rows = untested_rows[~may_see]
             points = points[~may_see]
         return replace(registered, sweep=sweep.select(in_view))
 
@@ -271,10 +286,17 @@ class Road:
 def choose_views(
     cameras: Collection[Camera], window: Stretch, keys: Sequence[int]
 ) -> list[tuple[Camera, Float]]:
-    """Return cameras with their ``T_cam_world`` (4,4); keys less than 3 m apart share a view."""
-    chosen: list[Float] = []
+    """Return the views of ascending keys: each camera with its pose ``T_cam_world`` (4,4).
+
+    A key at most 3 m from the last key with a view of its own shares that view.
+    """
+    key_poses: list[Float] = []
     for T_world_lidar in (window[key].T_world_lidar for key in keys):
-        last = chosen[-1] if chosen else None
+        last = key_poses[-1] if key_poses else None
         if last is None or np.linalg.norm(last[:3, 3] - T_world_lidar[:3, 3]) > _SAME_VIEW_M:
-            chosen.append(T_world_lidar)
-    return [(camera, camera.T_cam_lidar @ poses.inverse(T)) for camera in cameras for T in chosen]
+            key_poses.append(T_world_lidar)
+    return [
+        (camera, camera.T_cam_lidar @ poses.inverse(T_world_lidar))
+        for camera in cameras
+        for T_world_lidar in key_poses
+    ]

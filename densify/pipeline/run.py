@@ -5,7 +5,7 @@
 
     register and deskew the window     recording.window
     accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
-    find static surfaces beyond it     recording.find_beyond
+    find static surfaces beyond it     recording.find_far_surfaces
     see, project, fill, score          densify.pipeline.key_result, method by method
     complete with a prior              densify.pipeline.key_result
     warn                               densify.pipeline.warnings
@@ -50,7 +50,7 @@ from densify.pipeline.key_result import (
     result_of_method,
 )
 from densify.pipeline.process import Watch
-from densify.pipeline.recording import Beyond, Recording
+from densify.pipeline.recording import FarSurfaces, Recording
 from densify.pipeline.warnings import add_warnings
 from densify.readers.timeline import choose_cameras
 
@@ -210,18 +210,17 @@ def densify(
 
     with ThreadPoolExecutor(num_threads()) as pool:
         wants_far = any(METHODS[name].far for name in methods)
-        far = pool.submit(recording.find_beyond, key) if wants_far else None
+        future = pool.submit(recording.find_far_surfaces, key) if wants_far else None
         with_flow = settings.output.flow != "none"
         moments = {
             name: recording.moment(key, METHODS[name].all_sweeps, METHODS[name].engine, with_flow)
             for name in methods
         }
-        beyond = far.result() if far is not None else None
+        far_surfaces = None if future is None else future.result()
         if key == max(recording.cut.number_of):  # no later key needs them
             recording.sweeps.read.cache_clear()
-        scene = scene_of(
-            recording, key, shots, images, beyond, moments[methods[-1]].cloud, with_images, watch
-        )
+        cloud = moments[methods[-1]].cloud
+        scene = scene_of(recording, key, shots, images, far_surfaces, cloud, with_images, watch)
         are_filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene, moments)
         results_alone = list(pool.map(make, methods, are_filled))
@@ -252,7 +251,7 @@ def scene_of(
     key: int,
     shots: Mapping[str, Shot],
     images: Mapping[str, NDArray[np.uint8]],
-    beyond: Beyond | None,
+    far_surfaces: FarSurfaces | None,
     cloud: Cloud,
     with_images: bool,
     watch: Watch,
@@ -273,7 +272,9 @@ def scene_of(
         with watch.stage("held out"):
             held_out = HeldOut.of(views, cloud)
     shown = images if with_images else {}
-    return KeyScene(settings, key, stretch, beyond, key_image, views, shown, truth, held_out, watch)
+    return KeyScene(
+        settings, key, stretch, far_surfaces, key_image, views, shown, truth, held_out, watch
+    )
 
 
 def _or_error(make: Callable[[int], T], frame: int) -> T | ComputationError | InputError:

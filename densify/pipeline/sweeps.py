@@ -81,7 +81,7 @@ class Sweeps:
     def _content(self, frame: int) -> str:
         """Return a digest of a sweep and its recorded pose, or the message of its error."""
 
-        def find() -> str:
+        def make_digest() -> str:
             try:
                 return digest([self.read(frame), self.recorded_pose(frame)])
             except InputError as error:
@@ -89,7 +89,7 @@ class Sweeps:
 
         # Processes of a run share the digest, so only one of them reads the sweep.
         inputs = [self._run, self._sequence.name, self._settings, frame]
-        return kept(self._cache, "digests", lambda: inputs, find)
+        return kept(self._cache, "digests", lambda: inputs, make_digest)
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,7 @@ class Cut:
         after the block's first key.
 
         Args:
+            timeline: The recording's sweeps in time.
             window: Number of sweeps on each side of a key.
             keys: Frame numbers of the keys, in any order.
             beyond_s: Seconds by which a block is longer than its windows, on each side.
@@ -123,6 +124,7 @@ class Cut:
         for key in keys:
             check_key(key)
         groups = _group_keys(timeline, window, sorted(set(keys)))
+        # A block reaches from the first window, longer by ``beyond_s``, to the last.
         num_beside = window + round(beyond_s * 1e9 / timeline.period_ns)
         blocks = []
         for group in groups:
@@ -136,7 +138,7 @@ class Cut:
 def _group_keys(timeline: Timeline, window: int, keys: Sequence[int]) -> list[list[int]]:
     """Return ascending keys in groups that share a block."""
     groups: list[list[int]] = []
-    last_row = -1  # row of the last sweep in the window of the key before
+    last_row = -1  # row of the last sweep in the window of the key before; no window overlaps -1
     for key in keys:
         frames = timeline.window(key, window).frames
         overlaps = timeline.row[frames[0]] <= last_row

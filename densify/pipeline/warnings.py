@@ -25,9 +25,9 @@ _LEAST_DENSITY = 0.001  # share of the pixels; sixteen rings alone measure 0.005
 _SLOW_S = 0.15  # period of sweeps; at 5 Hz the motion of a truck along its own side is ambiguous
 _OTHER_CLOCK_S = 1.0  # time from a sweep to the nearest image that suggests two clocks
 _LEAST_SIDE = 2  # sweeps on each side of the key, over which recorded poses are compared
-_MUCH_NEAR = 0.2  # share of the points; a car's own returns were 0 to 14 %
-_MUCH_BELOW = 0.0025  # share of the points; clean recordings have up to 0.0021
-_MUCH_MOVES = 1 / 3  # share of the points; most returns are of ground and buildings
+# Suspicious shares of the points. A car's own returns were up to 0.14. Clean recordings have up to
+# 0.0021 below the ground. Most returns are of ground and buildings.
+_MAX_NEAR, _MAX_BELOW, _MAX_MOVING = 0.2, 0.0025, 1 / 3
 
 
 def add_warnings(
@@ -61,12 +61,12 @@ def add_warnings(
     return warned
 
 
-def _warn_of_window(recording: Recording, key: int, follows: bool) -> Iterator[str]:
-    """Yield warnings about a small window. follows: True if a method estimates scene flow."""
+def _warn_of_window(recording: Recording, key: int, has_flow: bool) -> Iterator[str]:
+    """Yield warnings about a small window, also for scene flow if ``has_flow``."""
     window = recording.window_frames(key)
-    for cut in window.cuts:
-        yield f"the window is cut to frames {format_frames(window.frames)}: {cut}"
-    if follows and recording.is_pair(key):
+    for reason in window.cuts:
+        yield f"the window is cut to frames {format_frames(window.frames)}: {reason}"
+    if has_flow and recording.is_pair(key):
         yield "in two sweeps moving objects are found less well than in three or more"
 
 
@@ -91,14 +91,14 @@ def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"are left out, and motion is less certain"
         )
     share_near = _share_near(sweeps)
-    if share_near > _MUCH_NEAR:
+    if share_near > _MAX_NEAR:
         yield (
             f"register.min_range_m = {settings.register.min_range_m:g} takes "
             f"{100 * share_near:.0f} % of the points as the own vehicle's; indoors and on small "
             f"robots set it to the reach of the vehicle"
         )
     share_below = recording.share_below(key)
-    if share_below > _MUCH_BELOW:
+    if share_below > _MAX_BELOW:
         yield (
             f"{100 * share_below:.1f} % of the points lie below the ground, as mirror images of a "
             f"wet road and echoes over two surfaces do; they are left out"
@@ -112,7 +112,7 @@ def _warn_of_silent_scanners(sweeps: Sequence[Sweep]) -> Iterator[str]:
         if silent:
             yield (
                 f"sweeps {format_frames(silent)} have no returns of scanner {lidar}, which others "
-                f"have: static surfaces that it alone sees are of other sweeps"
+                f"have: surfaces that only this scanner sees are measured in other sweeps alone"
             )
 
 
@@ -124,7 +124,7 @@ def _share_near(sweeps: Sequence[Sweep]) -> float:
 
 def _warn_of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
     """Yield warnings about directions in which raw sweeps lack returns."""
-    if _share_near([registered.sweep for registered in stretch.sweeps]) > _MUCH_NEAR:
+    if _share_near([registered.sweep for registered in stretch.sweeps]) > _MAX_NEAR:
         return  # they may lack the returns that are left out as the own vehicle's
     returns = np.stack([recording.sweeps.returns_by_azimuth(frame) for frame in stretch.frames])
     widths_deg = zip(stretch.frames, lost_deg(returns), strict=True)
@@ -176,7 +176,7 @@ def _warn_of_recorded_poses(recording: Recording, key: int) -> Iterator[str]:
         recorded = [recording.sequence.T_world_lidar(frame) for frame in (run[0], run[-1])]
     except InputError:
         return  # too short or too poor to compare
-    # the motion from the first sweep to the last
+    # From the first sweep to the last
     recorded_motion = poses.inverse(recorded[0]) @ recorded[-1]
     odometry_motion = poses.inverse(odometry[0]) @ odometry[-1]
     error = RecordedError.of([recorded_motion], [odometry_motion])
@@ -217,7 +217,7 @@ def warn_of_result(result: Result, stretch: Stretch) -> Iterator[str]:
                 f"sweeps are {period_s:.2g} s apart: fast objects are followed less exactly than "
                 f"at 10 Hz, and lost where they turn or are occluded between two"
             )
-    if result.cloud.moving.mean() > _MUCH_MOVES:
+    if result.cloud.moving.mean() > _MAX_MOVING:
         yield (
             f"{100 * result.cloud.moving.mean():.0f} % of the points move, more than in any "
             f"traffic: are poses and times of points right? densify doctor looks into both"

@@ -13,7 +13,7 @@ import numpy as np
 
 from densify.config import RegisterSettings
 from densify.config.errors import InputError
-from densify.free_space.raw_sweeps import without_lone
+from densify.free_space.raw_sweeps import remove_lone_returns
 from densify.geometry.types import Camera, Int, LidarSequence, Sweep, Trajectory
 
 _HOLE_PERIODS = 3.1  # a longer step is a hole in time: 3 periods and some jitter
@@ -222,7 +222,7 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
     range_m = np.sqrt(x * x + y * y + z * z)
     is_near = range_m < settings.min_range_m
     inside = sweep.select(~is_near & (range_m <= settings.max_range_m))
-    return without_lone(replace(inside, num_near=int(is_near.sum())))
+    return remove_lone_returns(replace(inside, num_near=int(is_near.sum())))
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:

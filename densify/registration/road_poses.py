@@ -269,7 +269,7 @@ class _Graph:
         # Cauchy weights, which limit the influence of wrong alignments
         weight = 1 / (1 + (self._error_m(residual) / _USUAL_M) ** 2)
         # Derivative of the residual by the motions of the target (first 6) and of the source
-        adjoint = poses.carried(poses.inverse(self._T_target_source(T))[:, None], np.eye(6))
+        adjoint = poses.transform_twist(poses.inverse(self._T_target_source(T))[:, None], np.eye(6))
         slope = np.zeros((len(residual), 6, 12))
         slope[:, :, :6] = -adjoint.transpose(0, 2, 1)
         slope[:, :, 6:] = np.eye(6)

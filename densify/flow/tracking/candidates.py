@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import num_threads

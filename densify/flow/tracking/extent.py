@@ -14,7 +14,7 @@ from densify.flow.tracking.candidates import LINK_M, Obstacles, Strips, firing_t
 from densify.flow.tracking.following import MAX_MISSED_S
 from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track, near_m
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock

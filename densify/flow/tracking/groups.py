@@ -18,7 +18,7 @@ from densify.flow.tracking.extent import Instance, assign_points, find_shape, is
 from densify.flow.tracking.objects import MovingObject, Shape, Track, near_m
 from densify.flow.tracking.soften import Snapshot, Softened, soften
 from densify.flow.tracking.tracks import find_tracks
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import num_threads

@@ -18,7 +18,7 @@ import numpy as np
 from densify.config.file_content import read_json
 from densify.flow.tracking.candidates import LINK_M, Obstacles
 from densify.flow.tracking.objects import MovingObject, Track, near_m
-from densify.free_space.seen_through import REACH_S, FreeSpace
+from densify.free_space.range_image import REACH_S, FreeSpace
 from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Bool, Float
 

@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from densify.flow.surface_matching import apply, undo
 from densify.flow.tracking.candidates import Batch, Obstacles
 from densify.free_space.ground import HeightMap
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 

@@ -31,7 +31,7 @@ from densify.flow.tracking.following import (
 from densify.flow.tracking.likelihood import NUM_ASKED, RecordEvidence, Verdict, judge
 from densify.flow.tracking.objects import LANE_M, Lane, MovingObject, Shape, Track
 from densify.free_space.ground import HeightMap
-from densify.free_space.seen_through import FreeSpace
+from densify.free_space.range_image import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock

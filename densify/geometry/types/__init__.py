@@ -40,5 +40,5 @@ from densify.geometry.types.results import (
     Rejected,
     Result,
     StageCost,
-    StandingWorld,
+    StaticWorld,
 )

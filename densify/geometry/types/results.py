@@ -108,7 +108,7 @@ class Patches(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StandingWorld:
+class StaticWorld:
     """K points on static surfaces along the road, from n sweeps."""
 
     points: Float32  # (K,3) metres, in the world of the registered window
@@ -122,15 +122,15 @@ class StandingWorld:
     stamp_ns: Int  # (n,) reference times
     left_out: tuple[int, ...] = ()  # frame numbers of sweeps without a reliable registration
 
-    def select(self, keep: Bool | Int) -> StandingWorld:
+    def select(self, keep: Bool | Int) -> StaticWorld:
         """Return a world with only the points of a (K,) mask, or of an array of point indices."""
-        return select_rows(self, keep, _COLUMNS_OF_STANDING)
+        return select_rows(self, keep, _WORLD_COLUMNS)
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-_COLUMNS_OF_STANDING = ("points", "normal", "spacing_m", "source", "row", "lidar", "intensity")
+_WORLD_COLUMNS = ("points", "normal", "spacing_m", "source", "row", "lidar", "intensity")
 
 
 class Reason(IntEnum):
