@@ -224,4 +224,4 @@ def test_of_two_sweeps_the_pair_alone_tells_what_moves() -> None:
     assert np.mean(field.moving[moves]) > 0.85 and field.moving[~moves].mean() < 0.005
     off_m = np.linalg.norm(field.displacement - true_m, axis=1)
     assert off_m[moves].mean() < 0.09 and off_m[moves & field.moving].mean() < 0.04
-    assert any("two sweeps" in told for told in _warn_of_window(recording, 100, follows=True))
+    assert any("two sweeps" in told for told in _warn_of_window(recording, 100, has_flow=True))
