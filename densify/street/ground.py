@@ -83,7 +83,7 @@ class Ground:
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float) -> Mesh:
-        """Return the mesh: cells of ``cell_m`` within ``margin_m`` of the kerb, of 8 m elsewhere."""
+        """Return the mesh: cells of ``cell_m`` within ``margin_m`` of roads, of 8 m elsewhere."""
         centre = np.concatenate([road.curve(road.curve.knots_m) for road in self.roads])
         low = centre.min(axis=0) - margin_m - _BORDER_M
         high = centre.max(axis=0) + margin_m + _BORDER_M

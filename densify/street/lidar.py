@@ -368,13 +368,9 @@ class Mount(NamedTuple):
 
 
 def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) -> Returns:
-    """Simulate a sweep of a mounted sensor, and return the returns that its receivers detect.
+    """Return the simulated returns of a mounted sensor's sweep; ``rng`` draws noise and losses.
 
-    Args:
-        world: Bodies that the beams hit.
-        mount: Sensor, and the vehicle that carries it.
-        time_s: Reference time, the middle of the sweep, in seconds since frame 0.
-        rng: Source of noise and of lost returns, which is advanced.
+    The middle of the sweep is at ``time_s``, in seconds since frame 0.
     """
     sensor = mount.sensor
     T = T_ego_lidar(mount.tilt_deg)

@@ -84,12 +84,9 @@ class Mesh:
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """Return a mesh of K quads, each of two triangles. Its object numbers are -1.
+        """Return a mesh of quads (K,4,3), metres, corners in order around, without object numbers.
 
-        Args:
-            corners: (K,4,3) corners in metres, in order around. Texture x is along the first side.
-            material: Material of all quads.
-            tint: Factors on the colour, (3,) for all quads or (K,3).
+        Texture x is along the first side. ``tint`` is (3,) for all quads or (K,3).
         """
         num = len(corners)
         first_side = corners[:, 1] - corners[:, 0]

@@ -62,7 +62,7 @@ class Curve:
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """Return a curve of ``length_m`` that passes the origin along +x at arc length ``origin_m``.
+        """Return a curve of ``length_m`` through the origin along +x, at arc length ``origin_m``.
 
         ``curvature`` maps (N,) arc lengths to (N,) curvatures in 1/m, positive to the left.
         """
@@ -143,7 +143,7 @@ class Speed:
         self._travelled = np.concatenate([[0.0], np.cumsum(steps)])
 
     def distance(self, times_s: Float) -> Float:
-        """Return the (N,) metres travelled since the first knot at (N,) seconds, negative before."""
+        """Return the (N,) metres travelled since the first knot at (N,) seconds, below 0 before."""
         last = len(self._t) - 1
         before = np.clip(np.searchsorted(self._t, times_s, side="right") - 1, 0, last)
         after = np.minimum(before + 1, last)

@@ -184,13 +184,9 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Place a mesh on the ground, and note the footprint of its solid part.
+        """Place a mesh on the ground at ``xy`` (2,), metres, world, turned about z by a heading (rad).
 
-        Args:
-            mesh: Mesh with its origin on the ground, z up.
-            xy: (2,) position in metres, world.
-            heading: Rotation about z in rad.
-            solid: Part of the mesh that traffic must not touch; None for the whole mesh.
+        ``solid`` is the part of the mesh that traffic must not touch, None for the whole mesh.
         """
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
@@ -201,7 +197,7 @@ class Scenery:
         self.footprints.append(Rectangles.of(solid, pose))
 
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
-        """Return True if a mesh placed by `put` is 0.3 m from others, ``kerb_gap_m`` from the kerb."""
+        """Return True if a mesh is 0.3 m from all objects, and ``kerb_gap_m`` from the kerb."""
         outline = Rectangles.of(mesh, upright((*xy, 0.0), heading), _CLEAR_M)
         if self.footprints:
             self.footprints = [Rectangles.joined(self.footprints)]
@@ -221,7 +217,7 @@ class Scenery:
             self.put(mesh, xy, heading, solid)
 
     def park(self, xy: Float, forward: Float) -> None:
-        """Place a random parked car at ``xy`` (2,), metres, along the unit vector ``forward`` (2,)."""
+        """Place a random parked car at ``xy`` (2,), world, along the direction ``forward`` (2,)."""
         mesh = models.parked_car(FIRST_PARKED + self._num_parked, self.rng)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2

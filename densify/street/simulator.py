@@ -48,7 +48,7 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Return the truth of N points, `place`'s arguments; ``instance`` (N,) has object numbers."""
+        """Return the truth of N points, as for `place`, with the objects ``instance`` (N,)."""
         T_world_lidar = self.T_world_lidar[frame]
         from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
         return SweepTruth(
@@ -60,7 +60,8 @@ class Bodies:
     ) -> Float:
         """Return the true flow (N,3), metres, of the points of `place` to the time of ``target``.
 
-        It is in the lidar frame of ``frame``, ego-motion removed. InputError: no such target.
+        It is in the lidar frame of ``frame``, ego-motion removed. An unknown target raises
+        InputError.
         """
         self.check(target)
         after = self.place(target, body, points)

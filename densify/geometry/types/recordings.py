@@ -210,10 +210,7 @@ class Motion(Protocol):
     """The motion of all points of a stretch, found by any engine (scene-flow method)."""
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Return the flow of the points of sweep ``frame`` to sweep ``target``'s reference time.
-
-        Both are frame numbers of the stretch.
-        """
+        """Return the flow of the points of sweep ``frame`` to the reference time of ``target``."""
         ...
 
 
