@@ -65,9 +65,9 @@ class Gate(Section):
     split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
-        """Return the first limit that a key sweep exceeds, as a text, None if it exceeds none.
+        """Return why a key sweep is beyond a limit, None if it is within all limits.
 
-        ``scores`` are those of a manifest line; ``num_sweeps`` is the size of its window.
+        ``scores`` are those of a manifest line. ``num_sweeps`` is the size of the window.
         """
         ghost, outliers = scores["ghost"], scores["outliers"]
         if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
@@ -199,10 +199,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return the content of dataset.json in a training set, None if the file does not exist.
-
-    A damaged file, or one of another version of the schema, raises InputError.
-    """
+    """Return the content of dataset.json, None without the file; InputError if it is damaged."""
     path = out / _FILE
     if not path.is_file():
         return None

@@ -22,7 +22,6 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     ghosts. Points of the key sweep and of sweeps beyond the window are False in both masks.
 
     Args:
-        cloud: Accumulated cloud of M points.
         key_image: Range image of the key sweep.
         key: Frame number of the key sweep.
     """

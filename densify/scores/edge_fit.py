@@ -154,7 +154,7 @@ def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, flo
 
 
 def turned(camera: Camera, offset: Float) -> Camera:
-    """Return the camera turned by a (4,) offset: pitch, yaw, roll in degrees, unused seconds."""
+    """Return the camera turned by pitch, yaw and roll (degrees) of an offset (4,), as in `Fit`."""
     turn = poses.exp(np.append(np.deg2rad(offset[:3]), np.zeros(3)))
     return replace(camera, T_cam_lidar=turn @ camera.T_cam_lidar)
 

@@ -60,8 +60,7 @@ def main_error(
 ) -> tuple[str, str]:
     """Return a clause about the main error of recorded motions (4,4), and one about its correction.
 
-    The error is against odometry, in scale or as drift over ``duration_s``. The correction is "" if
-    there is none.
+    The error is a scale, or a drift over ``duration_s``. Without correction, that clause is "".
     """
     recorded_m, odometry_m = (
         np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)

@@ -117,7 +117,6 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
     Pixels outside the view of the lens are black, with depth 0 and body -1.
 
     Args:
-        world: Bodies in view.
         ego: Motion of the ego vehicle.
         camera: Camera whose pose is relative to a lidar on a level mount.
         time_s: Exposure of the middle row, in seconds since frame 0.

@@ -81,7 +81,7 @@ class Raster(_Steady):
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the (N,3) unit vectors of pulses, with the arguments of `Spinning.directions`."""
+        """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
         line = number * (self.lines_per_s / self.pulses_per_s)
         swing = 1 - np.abs(line % 2 - 1)  # from 0 to 1 in one line, back to 0 in the next
         azimuth = np.radians(self.width_deg) * (0.5 - swing)
@@ -98,7 +98,7 @@ class Rosette(_Steady):
     turns_per_s: tuple[float, float]
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the (N,3) unit vectors of pulses, with the arguments of `Spinning.directions`."""
+        """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
         first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
         axis_angle = np.radians(self.width_deg / 2) * np.cos(first - second)
         roll = first + second
@@ -194,10 +194,7 @@ class Firings:
 
 
 def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
-    """Return the pulses of all scanners in a sweep of ``period_ns``, ascending in time.
-
-    The middle of the sweep is at ``time_s``, in seconds since frame 0. Each scanner fires evenly.
-    """
+    """Return a sweep's pulses, evenly spaced about its middle ``time_s``, seconds since frame 0."""
     pulses = []
     for index, scanner in enumerate(sensor.scanners):
         num = scanner.pattern.num_pulses(period_ns * _S_PER_NS)
@@ -287,7 +284,7 @@ def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
 
 
 def patches(position: Float, owner: Int) -> Float:
-    """Return (N,) random numbers, 0 to 1, that vary smoothly over the surface of each object.
+    """Return (N,) random numbers from 0 to 1 that vary smoothly over the surface of an object.
 
     ``position`` (N,3) has points in metres, ``owner`` (N,) the numbers of their objects.
     """

@@ -233,7 +233,7 @@ def _spoked_wheel(row: Any, x_m: float) -> list[Mesh]:
 
 
 def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
-    """Return a house around the origin, its front along x, facing -y: walls, roof, openings."""
+    """Return a house around the origin, ``width_m`` along x, ``depth_m`` along y, facing -y."""
     shape = _SHAPES.house
     storeys = int(rng.integers(*shape.num_storeys))
     height = shape.storey_m * storeys + shape.attic_m

@@ -184,7 +184,7 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Place a mesh on the ground at ``xy`` (2,), metres, world, turned about z by a heading (rad).
+        """Place a mesh on the ground at ``xy`` (2,), world, turned by a heading (rad) about z.
 
         ``solid`` is the part of the mesh that traffic must not touch, None for the whole mesh.
         """

@@ -48,7 +48,7 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Return the truth of N points, as for `place`, with the objects ``instance`` (N,)."""
+        """Return the truth of a sweep's points, as in `place`, of the objects ``instance`` (N,)."""
         T_world_lidar = self.T_world_lidar[frame]
         from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
         return SweepTruth(
@@ -115,7 +115,7 @@ class Simulator:
         return build_scene(self.preset, self.seed)
 
     def returns(self, frame: int) -> Returns:
-        """Simulate the sweep of a frame, and return its returns."""
+        """Return the returns of the simulated sweep of a frame."""
         rng = np.random.default_rng([self.seed, 1, frame])
         time_s = seconds(self.stamp_ns(frame))
         mount = Mount(self.scene.ego, self.sensor, self.period_ns, self.tilt_deg)

@@ -87,8 +87,7 @@ class Trajectory:
     def part(self, frames: Sequence[int], origin: int) -> Trajectory:
         """Return the poses of some frames in the levelled lidar frame of the sweep ``origin``.
 
-        The frame numbers must be of this trajectory, otherwise ValueError is raised. Their order is
-        kept.
+        The order of ``frames`` is kept. A frame that the trajectory lacks raises ValueError.
         """
         rows = [self.frames.index(frame) for frame in frames]
         T_new_lidar = np.eye(4)
@@ -401,7 +400,7 @@ class SweepTruth:
 class Truth(Protocol):
     """Exact ground truth of a simulated sequence.
 
-    Arrays by point are in the order of the stored sweep, into which `Sweep.row` holds the indices.
+    Arrays by point have a row for each row of the stored sweep: `Sweep.row` selects from them.
     """
 
     def sweep(self, frame: int) -> SweepTruth:
@@ -424,5 +423,5 @@ class Truth(Protocol):
         ...
 
     def moving_mask(self, camera: str, number: int) -> Bool:
-        """Return an (H,W) mask, True at the pixels of moving objects; arguments of `depth_m`."""
+        """Return an (H,W) mask of the image ``number`` of a camera, True at moving objects."""
         ...
