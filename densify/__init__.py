@@ -7,12 +7,12 @@ Names are imported on first use, so ``import densify`` loads no torch::
 
     sequence = densify.open_sequence("street")
     result = densify.run(sequence, key=120, window=5)
-    result.depth["image_02"].depth_m  # (H,W) float32 metres, 0 none
+    result.depth["image_02"].depth_m  # (H,W) float32 metres, 0 for no depth
 
 `InputError` means that something given is missing, damaged, unknown or out of range, and its
 subclass `OutputError` that a file cannot be written. `ComputationError` means that a stage's result
 is not reliable. A message is one line: what happened, where, what was expected, what to do.
-Docstrings do not repeat these errors.
+Docstrings name an error if its cause cannot be guessed from the arguments.
 """
 
 from __future__ import annotations

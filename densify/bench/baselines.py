@@ -77,10 +77,10 @@ def _maps(subject: Subject) -> dict[str, Float32]:
 
 
 def ip_basic(sparse_m: Float32) -> Float32:
-    """Return a depth map filled by dilation and closing, (H,W) metres, 0 where nothing is near.
+    """Return a map filled by dilation and closing, (H,W) metres, 0 where nothing is near.
 
-    Ku, Harakeh, Waslander, "In Defense of Classical Image Processing: Fast Depth Completion on the
-    CPU", CRV 2018, without the extension to the top of the image.
+    ``sparse_m`` is (H,W) metres, 0 for none. Source: Ku, Harakeh, Waslander, "In Defense of
+    Classical Image Processing: Fast Depth Completion on the CPU", CRV 2018, not extended upwards.
     """
     has_depth = (sparse_m > 0) & (sparse_m < _FARTHEST_M)
     inverted = np.where(has_depth, np.float32(_FARTHEST_M) - sparse_m, np.float32(0))

@@ -72,7 +72,10 @@ class TruthMap(NamedTuple):
 
 
 class Altered:
-    """A recording with altered sweeps or other recorded poses; all else is as recorded."""
+    """A recording with altered sweeps or other recorded poses; all else is as recorded.
+
+    ``sweep`` alters each sweep. ``T_world_lidar`` maps a frame to its pose. None changes nothing.
+    """
 
     def __init__(
         self,
@@ -100,7 +103,11 @@ def without_scanner(sequence: LidarSequence, scanner: int) -> Any:
 def scanner_truth(
     scanner: int, recording: Recording, key: int, shots: Mapping[str, Shot]
 ) -> dict[str, TruthMap]:
-    """Return the depth measured by one scanner in the key sweep, by name of the map."""
+    """Return the depth measured by one scanner in the key sweep, by name of the map.
+
+    ``scanner`` is its index, ``key`` the key's frame number, ``shots`` are the views by map name.
+    Returns that a nearer return beside them may occlude are left out.
+    """
     sequence = recording.sequence
     config = recording.settings
     cloud = recording.moment(key, all_sweeps=True, engine="").cloud
@@ -129,7 +136,10 @@ def scanner_truth(
 def exact_truth(
     sequence: LidarSequence, key_sweep: Sweep, shots: Mapping[str, Shot], config: Config
 ) -> dict[str, TruthMap]:
-    """Return map name -> exact depth within 80 m below the top ring; {} without exact truth."""
+    """Return map name -> exact depth within 80 m below the top ring; {} without exact truth.
+
+    Maps that show no image are left out.
+    """
     maps: dict[str, TruthMap] = {}
     if sequence.truth is None:
         return maps
@@ -201,7 +211,10 @@ def bench_depth(
     """Densify the key sweeps with each variant, and pool the scores over key sweeps and cameras.
 
     Args:
+        keys: Frame numbers of the key sweeps.
+        window: Number of sweeps on each side of a key sweep.
         variants: Name -> settings to compare.
+        cameras: Names of the cameras, None for all.
         scanner: Index of the scanner whose returns are the ground truth, None for none.
         method: Name of a method in `densify.pipeline.key_result.METHODS`.
 

@@ -30,7 +30,7 @@ _AXES = ("pitch", "yaw", "roll")
 def bench_doctor(
     sequences: Sequence[LidarSequence], config: Config, progress: Progress | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Give recordings errors; return error -> number of cases (``of``), share of each verdict."""
+    """Return error -> number of cases (``of``) and share of each verdict on recordings with it."""
     counts: dict[str, Counter[Verdict]] = {}
     for number, sequence in enumerate(sequences):
         if progress:

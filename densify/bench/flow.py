@@ -122,7 +122,7 @@ class SweepTruth(NamedTuple):
 
     @staticmethod
     def of(truth: Truth, stretch: Stretch, frame: int, key: int) -> SweepTruth:
-        """Gather the exact ground truth of the sweep ``frame`` (its number) of a window."""
+        """Return the exact ground truth of the sweep with the number ``frame`` in a window."""
         rows = stretch[frame].sweep.row
         frames = stretch.frames
         targets = (towards(key, frame, frames), key, frames[0], frames[-1])
@@ -163,7 +163,8 @@ class Scorer:
     ) -> Scorer:
         """Register the window of a key sweep, ``size`` sweeps on each side, and read its truth.
 
-        The ``folder`` has true flow (`densify.readers.flow_files`); None for exact truth, if any.
+        ``folder`` has files of true flow (`densify.readers.flow_files`). None takes the exact truth
+        of a simulated recording, and no truth for a real one.
         """
         recording = Recording(sequence, config, size, [key], looks_around=True)
         stretch = recording.window(key)
@@ -257,7 +258,7 @@ class Scorer:
 
 
 def towards(key: int, frame: int, frames: Sequence[int]) -> int:
-    """Return the next frame number of ``frames`` towards the key sweep, or the key sweep's own."""
+    """Return the frame number next to ``frame`` towards the key sweep, the key's own at the key."""
     row = frames.index(frame)
     return frames[row + int(np.sign(frames.index(key) - row))]
 
@@ -291,9 +292,9 @@ def _motion(stretch: Stretch, config: Config, asked: Sequence[int] | None = None
 
 
 class KeySweep(NamedTuple):
-    """A street and the key sweep of a row."""
+    """A recording and the key sweep that a row of a table is about."""
 
-    data: str
+    data: str  # specification of the recording
     key: int  # frame number
     window: int = 5  # number of sweeps on each side of the key sweep
 

@@ -259,7 +259,7 @@ class Subject(NamedTuple):
 
     @staticmethod
     def of(key: GateKey, folder: Path | None, cache: Cache | None) -> Subject:
-        """Open the recording of a key, and read or measure its true depth."""
+        """Open the recording of a key, below ``folder`` if real, and find its true depth."""
         whole, config = _opened(key, folder), resolve(None)
         sequence = without_scanner(whole, 1) if key.truth == "scanner" else whole
         recording = Recording(sequence, config, _WINDOW, [key.key], cache, looks_around=True)
@@ -281,7 +281,7 @@ class Subject(NamedTuple):
         return self.whole.cameras[self.key.camera]
 
     def figures(self, kinds: Collection[str], seed: int | None = None) -> dict[str, Any]:
-        """Return the figures of `measure`; with a seed, of slightly other poses."""
+        """Return name of the figure -> value; a seed moves the poses and thins the sweeps."""
         key, recording, registered = self.key.key, self.recording, self.recording
         if seed is not None:
             recording = _Moved(self.recording, key, seed)

@@ -102,7 +102,13 @@ def bench_paper(
     num_points: int = NUM_POINTS,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure methods and trained networks on pairs of clouds.
+    """Return the mean scores of methods and trained networks on pairs of clouds.
+
+    Args:
+        pairs: Pairs of clouds. InputError is raised if there are none.
+        methods: Keys of `METHODS`.
+        models: Paths of model files.
+        num_points: Number of points drawn from each cloud.
 
     Returns:
         ``num_pairs``, ``num_points`` and ``methods``: name of the method or file -> mean scores.

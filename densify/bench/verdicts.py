@@ -42,12 +42,12 @@ def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
 
 
 def coverage(outliers: Curve) -> float:
-    """Return the share of the true pixels with a depth in percent."""
+    """Return the coverage in percent: the share of pixels with a true depth that have a depth."""
     return 100 * outliers["covered"] / max(outliers["num"], 1)
 
 
 def outliers_at(outliers: Curve, covered_percent: float) -> float:
-    """Return the share of outliers in percent among the most certain pixels of this coverage."""
+    """Return the share of outliers, percent, among the most certain pixels of this coverage."""
     num = covered_percent / 100 * outliers["num"]
     steps = np.linspace(0, outliers["covered"], len(outliers["outliers"]))
     return float(100 * np.interp(num, steps, outliers["outliers"]) / max(num, 1))
@@ -139,10 +139,11 @@ def _verdict(name: str, change_of_key: Mapping[str, _KeyChange]) -> Verdict:
 def beyond_luck(
     before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
 ) -> dict[str, float]:
-    """Return those changes of one key's figures that are worse by more than luck explains.
+    """Return name -> change of those figures of a key that are worse by more than luck explains.
 
     Args:
-        before: Figures of the key by name, first measurement.
+        before: Figures of the key by name, first measurement; ``now`` has the second.
+        luck: Name of a `change` -> its standard deviation.
         sigmas: Limit, in standard deviations of the difference of two measurements.
     """
     worse = {}

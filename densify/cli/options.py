@@ -132,7 +132,7 @@ def _settings_of(usage: str) -> dict[str, Any]:
 
 
 def recordings_of(options: argparse.Namespace, default: str = "street") -> list[str]:
-    """Return the specifications of a command's recordings; without any, log the ``default``."""
+    """Return the specifications of a command's recordings, or ``default``, which is logged."""
     positional = [options.spec] if isinstance(options.spec, str) else options.spec or []
     specs = [*positional, *(options.data or [])]
     if not specs:
@@ -141,7 +141,7 @@ def recordings_of(options: argparse.Namespace, default: str = "street") -> list[
 
 
 def recording_of(options: argparse.Namespace) -> str:
-    """Return the specification of the only recording that a command names."""
+    """Return the specification of a command's only recording; raise InputError for several."""
     specs = recordings_of(options)
     if len(specs) > 1:
         raise InputError(f"got {len(specs)} recordings, {', '.join(specs)}; expected one")
@@ -178,7 +178,7 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = "", option: str = 
 
 
 def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frame numbers selected by ``--keys``; all frames for None."""
+    """Return the frame numbers in the range ``--keys``, all for None; InputError for no frame."""
     from densify.readers.timeline import format_frames
 
     frames = [frame for frame in sequence.frames if keys is None or frame in keys]

@@ -57,14 +57,14 @@ _MOST_REASONS = 20
 
 
 def answer_info(options: argparse.Namespace) -> Iterator[Answer]:
-    """Print what a recording holds."""
+    """Answer ``densify info``: yield what a recording holds."""
     sequence = open_sequence(recording_of(options))
     lines, frames, cameras = findings(sequence), [*sequence.frames], [*sequence.cameras]
     yield Answer(in_lines(lines), {"recording": dict(lines), "frames": frames, "cameras": cameras})
 
 
 def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
-    """Print the findings about a recording."""
+    """Answer ``densify doctor``: yield the findings; raise InputError if something is wrong."""
     config, spec = config_of(options), recording_of(options)
     sequence = open_sequence(spec)
     if options.write is not None:
@@ -102,7 +102,7 @@ def _verdicts(diagnosis: Diagnosis) -> str:
 
 
 def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
-    """Write the street and print its path."""
+    """Answer ``densify simulate``: write the street and yield its path."""
     street = Street.from_spec(recording_of(options))
     frames, chosen = list(street.frames), options.frames
     if chosen is not None and (chosen[0] < frames[0] or chosen[-1] > frames[-1]):
@@ -126,7 +126,7 @@ def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_dataset(options: argparse.Namespace) -> Iterator[Answer]:
-    """Make the data set, or report its progress."""
+    """Answer ``densify dataset``: make the set, or yield its progress."""
     yield from _make_set(options) if options.status is None else _check_set(options)
 
 
@@ -232,7 +232,7 @@ def _set_facts(summary: Summary) -> dict[str, Any]:
 
 
 def answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
-    """Estimate scene flow between two point files, or of a recording."""
+    """Answer ``densify flow``: estimate scene flow between two point files, or of a recording."""
     config = config_of(options)
     asks_for_sweeps = options.all or options.keys is not None
     if options.target is not None and options.data is None and not asks_for_sweeps:
@@ -303,7 +303,7 @@ def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Ite
 
 
 def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
-    """Label every sweep."""
+    """Answer ``densify labels``: write the flow of each sweep to the next, if both have boxes."""
     config = resolve(options.config, ["register.source=dataset", *(options.set or [])])
     sequence = open_sequence(recording_of(options))
     frames = selected_frames(sequence, options.keys)
@@ -332,7 +332,7 @@ def answer_labels(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_train_flow(options: argparse.Namespace) -> Iterator[Answer]:
-    """Train a network for scene flow."""
+    """Answer ``densify train flow``: train a network and write its model file."""
     from densify.learning.training import Training, train  # loads torch
 
     check_new_file(options.out, options.overwrite)

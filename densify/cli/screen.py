@@ -80,7 +80,7 @@ def _numbers(values: Mapping[str, Any], path: str) -> Iterator[tuple[str, float]
 
 
 def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
-    """Return rows as text, the first column left-aligned, the others aligned to ``side``."""
+    """Return rows of cells as text, the first column left-aligned, the others by ``side``."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     sides = ["<", *(side * (len(widths) - 1))]
     lines = (
@@ -91,7 +91,7 @@ def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
 
 
 def written(value: float | None, form: str) -> str:
-    """Return a number as text, "-" for None; ``form`` is its format, with a blank and a unit."""
+    """Return a number as text in the format ``form``, such as ".2f m" with a unit; "-" for None."""
     if value is None:
         return "-"
     number, _, unit = form.partition(" ")
@@ -99,7 +99,7 @@ def written(value: float | None, form: str) -> str:
 
 
 def percent(value: float | None, digits: int = 2) -> str:
-    """Return a share as a percentage."""
+    """Return a share, 0 to 1, as a percentage with this number of digits; "-" for None."""
     return written(value, f".{digits}%")
 
 
@@ -121,7 +121,7 @@ class Screen(logging.Handler):
         self._warnings: list[str] = []
 
     def begin(self, options: argparse.Namespace) -> None:
-        """Read ``--json`` from the options of a command."""
+        """Start the answer of a command: read its name and ``--json`` from the options."""
         verb = options.verb.name.rpartition(" ")[2]
         self._is_json = options.json
         self._facts = {"schema": _SCHEMA, "verb": verb, "files": [], "open_first": []}

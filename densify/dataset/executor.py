@@ -51,12 +51,12 @@ def call_all(
     gives a ComputationError as outcome. InputError and ComputationError of ``call`` are raised.
 
     Args:
-        call: A function of a module.
+        call: Function of one item, defined in a module so that processes can import it.
         groups: Non-empty groups of hashable, picklable items. A group's first item is finished
             before the others begin, so they find shared results in the cache.
         num_workers: Number of processes; 1 uses this process.
-        log: File to which worker processes append their log.
-        scheduler: Address of a Dask scheduler whose workers replace local processes.
+        log: File to which worker processes append their log; None for no log.
+        scheduler: Address of a Dask scheduler whose workers replace local processes, or None.
     """
     if num_workers == 1 and scheduler is None:
         for group in groups:
@@ -80,7 +80,10 @@ def call_all(
 
 @contextmanager
 def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
-    """Append the log messages of ``densify``, of one thread's identifier or all, to a file."""
+    """Append the log messages of ``densify`` to a file within the ``with`` block.
+
+    ``thread`` is the identifier of the only thread whose messages are kept, None for all threads.
+    """
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as error:
@@ -100,7 +103,7 @@ def logged_to(path: Path, thread: int | None = None) -> Iterator[None]:
 
 
 def share_of_cores(num_workers: int) -> dict[str, str]:
-    """Return environment variables that give one of ``num_workers`` an equal share of cores."""
+    """Return environment variables that give each of ``num_workers`` an equal share of cores."""
     share = str(max(1, len(os.sched_getaffinity(0)) // num_workers))
     names = [f"{library}_NUM_THREADS" for library in ("NUMBA", "OMP", "OPENBLAS", "MKL")]
     return dict.fromkeys([*names, "OPENCV_FOR_THREADS_NUM"], share)

@@ -74,7 +74,7 @@ class Summary:
         return self.num_keys - len(self.records)
 
     def mean(self, score: str) -> float | None:
-        """Return a score's mean over finished key sweeps and their cameras, None if unknown."""
+        """Return a manifest score's mean over finished key sweeps and cameras, None if unknown."""
         done = [record for record in self.records.values() if record.status == "done"]
         known = [value for record in done for value in record.values_of(score)]
         return sum(known) / len(known) if known else None
@@ -262,10 +262,11 @@ def _record(
 
 
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
-    """Return finished key -> reason, where ghosts or outliers exceed its neighbours' median.
+    """Return finished key -> reason, for keys with far more ghosts or outliers than neighbours.
 
-    They exceed it by more than ``max_ratio``. A limit for all recordings lets keys pass that are
-    bad for their own recording, such as keys with cut windows at its ends.
+    Such a share exceeds 0.1 % and ``max_ratio`` times the median of the neighbours in the
+    recording. Unlike a limit for all recordings, this detects keys that are bad for their own
+    recording, such as keys with cut windows at its ends.
     """
     drives: dict[str, list[KeyRecord]] = defaultdict(list)
     for record in records.values():
@@ -314,7 +315,10 @@ class Job:
 
 
 def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
-    """Densify and write one key, and return its record, ``failed`` on errors but OutputError."""
+    """Densify and write one key, given as (job, frame number), and return its record.
+
+    An error gives a record with the status ``failed``. Only OutputError is raised.
+    """
     job, key = job_and_key
     start_s = time.perf_counter()
     try:

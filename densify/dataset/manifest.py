@@ -59,7 +59,7 @@ class KeyRecord:
         return self.drive, self.key
 
     def values_of(self, score: str) -> list[float]:
-        """Return the known values of a score: one for each camera, or a single one."""
+        """Return the known values of a score: one for each camera, or a single one; [] for none."""
         score_value = self.scores.get(score)
         values = score_value.values() if isinstance(score_value, Mapping) else [score_value]
         return [value for value in values if value is not None]
@@ -95,10 +95,11 @@ class KeyRecord:
 
 
 def manifest(folder: str | Path) -> Any:
-    """Return a training set's manifest as a pandas.DataFrame, a row for each key sweep.
+    """Return a training set's manifest as a pandas.DataFrame, with a row for each key sweep.
 
     Columns are ``drive``, ``key``, ``status``, ``reason``, ``seconds``, ``num_sweeps``,
-    ``warnings``, and the scores, those of cameras as ``density.image_02``.
+    ``warnings``, and the scores, those of cameras as ``density.image_02``. Without pandas,
+    InputError is raised. A folder without a manifest gives an empty table.
     """
     pandas = needed("pandas", "pandas", "tables of a manifest")
     rows = []
@@ -116,7 +117,8 @@ def manifest(folder: str | Path) -> Any:
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     """Return the records of all manifests in a folder, ordered by drive and frame number.
 
-    In a file, the last line of a key sweep counts; of shards, done before aside before failed.
+    In a file, the last line of a key sweep counts. If several shards have a key sweep, done counts
+    before aside, and aside before failed.
     """
     rank = _STATUSES.index
     records: dict[Key, KeyRecord] = {}
@@ -128,7 +130,10 @@ def read_manifests(root: Path) -> dict[Key, KeyRecord]:
 
 
 def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> list[str]:
-    """Return a record's files that are missing or changed in size or, ``by_content``, in hash."""
+    """Return the paths, relative to ``root``, of a record's files that are missing or changed.
+
+    A file is changed if its size differs or, with ``by_content``, its hash.
+    """
     damaged = []
     for name, file in record.files.items():
         try:
@@ -143,7 +148,10 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Return the names of records done or aside whose files exist and, if asked, match hashes."""
+    """Return the names of the finished records: those put aside, and those done with whole files.
+
+    ``verify`` compares files with their hashes. Otherwise only their sizes are compared.
+    """
     return {
         record.name
         for record in records
@@ -156,7 +164,10 @@ class Manifest:
     """The manifest file of a run or shard, open for one process. Opening and closing sort it."""
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
-        """Open the manifest of a training set, or of shard (k, n); its folder is made if needed."""
+        """Open the manifest of a training set, or of shard (k, n); its folder is made if needed.
+
+        InputError is raised if another run has the manifest open.
+        """
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
         with self._errors_explained():
@@ -185,7 +196,10 @@ class Manifest:
             os.fsync(file.fileno())
 
     def set_aside(self, reasons: Mapping[Key, str]) -> list[KeyRecord]:
-        """Delete the files of these finished keys, record the reasons, return the new records."""
+        """Delete the files of these finished keys, record the reasons, return the new records.
+
+        Keys that are not done in this manifest are left out.
+        """
         aside = []
         for name, (record, _) in _read(self.path).items():
             if name not in reasons or record.status != "done":

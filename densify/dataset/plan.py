@@ -65,7 +65,10 @@ class Gate(Section):
     split: str = one_of("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
-        """Return the reason why a key sweep with a manifest's scores is not written, else None."""
+        """Return why a key sweep is beyond a limit, None if it is within all limits.
+
+        ``scores`` are those of a manifest line. ``num_sweeps`` is the size of the window.
+        """
         ghost, outliers = scores["ghost"], scores["outliers"]
         if self.min_sweeps is not None and num_sweeps < self.min_sweeps:
             return f"{num_sweeps} sweeps, expected at least {self.min_sweeps}"
@@ -132,7 +135,10 @@ class Drive:
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Open every recording and choose its key sweeps, by the arguments of `make_dataset`."""
+    """Return every recording with its chosen key sweeps, by the arguments of `make_dataset`.
+
+    InputError is raised for a recording that is given twice, has no camera or lacks the keys.
+    """
     drives: dict[str, Drive] = {}
     for spec in data:
         sequence = open_sequence(spec)
@@ -178,7 +184,10 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
 
 
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
-    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe."""
+    """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe.
+
+    InputError is raised if the earlier recipe or recordings differ.
+    """
     table = _table(recipe, drives)
     before = read_plan(out)
     if before is not None:
@@ -190,7 +199,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return the content of dataset.json, None if the file does not exist."""
+    """Return the content of dataset.json, None without the file; InputError if it is damaged."""
     path = out / _FILE
     if not path.is_file():
         return None

@@ -212,7 +212,11 @@ def write_comparison_page(folder: Path) -> Path:
 
 
 def write_report(folder: Path, overwrite: bool = False) -> list[Path]:
-    """Write the HTML pages of a run, comparison or training set, and return their paths."""
+    """Write the HTML pages of a run, comparison or training set, and return their paths.
+
+    InputError is raised if the folder holds none of these, or if a page exists that ``overwrite``
+    does not allow to replace.
+    """
     pages = _pages(folder)
     for path in pages:
         if path.exists() and not overwrite:

@@ -95,7 +95,11 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
 def camera_views(
     sample: Sample, camera: Camera, silhouettes: dict[int, Silhouettes]
 ) -> tuple[list[View], str]:
-    """Return all spots' views up to the first unreadable image, and its error, "" for none."""
+    """Return views of a camera, up to the first unreadable image, and its error, "" for none.
+
+    At most max(4, 36 / number of cameras) images are read, spread over all spots. The mapping
+    ``silhouettes``, frame -> silhouettes, is extended by missing frames.
+    """
     stamps_ns = sample.sequence.image_stamps_ns(camera.name)
     pairs = _pair_images(sample, stamps_ns)
     num_views = max(_LEAST_IMAGES, _MOST_IMAGES // len(sample.sequence.cameras))

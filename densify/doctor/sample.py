@@ -113,7 +113,7 @@ class Sample:
 
     @staticmethod
     def of(sequence: LidarSequence, settings: RegisterSettings) -> Sample:
-        """Read and register spots at the start, in the middle and at the end of the recording."""
+        """Read and register spots at start, middle and end; InputError if no sweep can be read."""
         timeline = Timeline.of(sequence)
         unreadable: dict[int, str] = {}
         spots = []
@@ -167,7 +167,7 @@ class Sample:
 
 
 def choose_frames(timeline: Timeline) -> list[list[int]]:
-    """Return the frame numbers of each spot: sweeps about 0.1 s apart, without a hole in time."""
+    """Return the frame numbers of up to 3 spots, each of up to 5 sweeps about 0.1 s apart."""
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     runs = timeline.runs(timeline.frames)  # without a hole in time
     # from the first to the last sweep of a spot, both included

@@ -41,17 +41,23 @@ _CONVERGED = np.sqrt(np.finfo(float).eps)
 
 
 def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
-    """Return the projection of points (N,3), metres, camera frame, into the image of a camera.
+    """Return the image coordinates of points, and a mask of the visible points.
 
     A distortion polynomial is valid only inside the image. Beyond the angle at which the distorted
     radius stops growing, it would fold points back into the image. Such points, and points more
     than the camera's ``max_angle_deg`` off its axis, are invisible.
+
+    Args:
+        points_cam: (N,3) points in metres, camera frame.
 
     Returns:
         uv: (N,2) image coordinates in pixels, integers at pixel centres. NaN for a point that is
             too near or outside the view of the lens.
         visible: (N,) True for a point in the view of the lens that falls on a pixel after ``rint``
             and is farther than 0.1 m: in z for a pinhole, in range for other lenses.
+
+    Raises:
+        InputError: If the lens model is unknown, or its coefficients are wrong in number or value.
     """
     lens = _lens(camera)
     uv = np.full((len(points_cam), 2), np.nan)
@@ -69,7 +75,11 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
 
 
 def rays(camera: Camera, uv: Float) -> Float:
-    """Return (N,3) unit rays, camera frame, of pixels ``uv`` (N,2); NaN outside the lens's view."""
+    """Return the (N,3) unit vectors, camera frame, from the lens to pixels ``uv`` (N,2).
+
+    Integers are at pixel centres. A pixel outside the view of the lens has NaN. A wrong lens raises
+    InputError, as in `image_points`.
+    """
     lens = _lens(camera)
     plane_xy = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
     if not camera.is_rectified:
@@ -82,7 +92,7 @@ def rays(camera: Camera, uv: Float) -> Float:
 
 
 def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
-    """Return the (N,2,3) Jacobian of the projection of visible points (N,3), camera frame.
+    """Return the (N,2,3) Jacobian of the projection of visible points (N,3), metres, camera frame.
 
     Element [n, i, j] is the change of u (i = 0) or v (i = 1) in pixels per metre along axis j.
     """
@@ -102,19 +112,22 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
 
 
 def depth_along(points_cam: Float, measure: str) -> Float:
-    """Return (N,) depths (m) of points (N,3), camera frame: ``z`` along the axis or ``range``."""
+    """Return the (N,) depths in metres of points (N,3), camera frame.
+
+    The ``measure`` is ``z``, along the optical axis, or ``range``, from the origin.
+    """
     return points_cam[:, 2] if measure == "z" else np.linalg.norm(points_cam, axis=1)
 
 
 def convert_depth(camera: Camera, depth_m: Float32, from_measure: str, to_measure: str) -> Float32:
-    """Return a depth map of a camera converted from one measure of depth to another.
+    """Return a depth map in another measure of depth.
 
-    Pixels whose ray has z <= 0 become 0. If the measures are the same, the map is returned
-    unchanged.
+    Pixels whose ray has z <= 0 become 0. If both measures are the same, the result is ``depth_m``
+    itself, no copy.
 
     Args:
-        depth_m: (H,W) depth in metres, 0 for none.
-        from_measure: ``z``, along the optical axis, or ``range``.
+        depth_m: (H,W) depth in metres, 0 for no depth.
+        from_measure: ``z``, depth along the optical axis, or ``range``, distance from the lens.
         to_measure: ``z`` or ``range``.
     """
     if from_measure == to_measure:

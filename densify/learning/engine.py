@@ -19,12 +19,12 @@ MOVES_M_S = 0.5
 
 
 def check_argument(argument: str) -> None:
-    """Raise InputError unless the argument is the path of a model file."""
+    """Raise InputError unless the argument is the path of a readable model file."""
     read_model(Path(argument))
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Return the motion of a scene by the network of the model file ``argument``."""
+    """Return the motion of a scene's points by the network in the model file ``argument``."""
     model = read_model(Path(argument))
     sweeps = scene.stretch.sweeps
     pairs = zip(sweeps, scene.candidates, strict=True)
@@ -47,8 +47,8 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 def flows_of(model: Model, above: list[AboveGround], origins: list[Float]) -> list[Float]:
     """Return for each sweep the flow (n,3) to the next sweep, metres, world, ego-motion removed.
 
-    The last sweep has its flow to the previous sweep, a single one flow 0. ``above`` are the points
-    above the ground, ``origins`` (3,) the position of the scanner in each sweep, world.
+    The last sweep has its flow to the previous sweep. A single sweep has flow 0. ``above`` has the
+    points above the ground of each sweep, ``origins`` the (3,) position of its scanner, world.
     """
     flows = []
     for index, source in enumerate(above):

@@ -59,7 +59,10 @@ class BoxMargins(NamedTuple):
 def label_sweeps(
     sequence: LidarSequence, frames: Sequence[int], config: Config, progress: Progress | None = None
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
-    """Yield (frame number, label or error) of each sweep with a next sweep and with boxes."""
+    """Yield (frame number, label or error) of each sweep with a next sweep and with boxes.
+
+    A recording without any boxes raises InputError.
+    """
     boxes = getattr(sequence, "boxes", None)
     if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
         known = ", ".join(f"{row.boxes} ({row.name})" for row in READERS if row.boxes)
@@ -92,7 +95,10 @@ def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: in
 
 
 def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
-    """Write the label's flow file ``FRAME_NEXT.npz`` into a folder and return its path."""
+    """Write a label's flow file ``FRAME_NEXT.npz`` into a folder, and return its path.
+
+    InputError is raised if the file exists and ``overwrite`` is False.
+    """
     sweep, field = label.registered.sweep, label.field
     path = folder / f"{sweep.frame:06d}_{label.after.frame:06d}.npz"
     if path.exists() and not overwrite:

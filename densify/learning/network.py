@@ -116,7 +116,10 @@ class Voxels(nn.Module):
             self.decode[-1].bias.zero_()  # type: ignore[operator, union-attr]
 
     def forward(self, sweeps: Sweeps) -> Tensor:
-        """Return the flow (n,3), m, world axes, of the first sweep's points; 0 off the grid."""
+        """Return the flow (n,3), metres, world axes, of the first sweep's points.
+
+        Points off the grid have flow 0.
+        """
         clouds = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
         source = clouds[0]
         if source is None:
@@ -241,7 +244,7 @@ class Model:
     provenance: Mapping[str, Any] = field(default_factory=dict)  # how it was trained, for JSON
 
     def flow(self, sweeps: Sweeps) -> Float:
-        """Return `Voxels.forward` as an array, with the same bytes on any number of cores."""
+        """Return the (n,3) flow of `Voxels.forward` as an array, equal on any number of cores."""
         with on_one_thread(), torch.inference_mode():
             displacement_m: Float = self.network(sweeps).double().numpy()
         return displacement_m

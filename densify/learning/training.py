@@ -165,7 +165,7 @@ class ClipMaker:
     teacher: str = "objective"  # source of the labels, as in `make_clip`
 
     def __call__(self, number: int) -> Clip:
-        """Make the clip of a number."""
+        """Return the clip of a number, at a recording and key that the number determines."""
         rng = np.random.default_rng([self.seed, number])
         spec = self.data[int(rng.integers(len(self.data)))]
         is_new_street = spec.partition("?")[0] == STREETS
@@ -205,6 +205,8 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str)
     """Return the clip of up to 7 sweeps around a key frame.
 
     Args:
+        key: Frame number, in the middle of the clip unless the recording ends.
+        settings: Settings of registration and of the engine.
         teacher: Source of the labels: "truth" for the ground truth, "engine" for the flow of the
             engine ``groups``; other names give no labels.
     """
@@ -287,9 +289,13 @@ def sample_of(
     num_wanted: int,
     rng: np.random.Generator | None = None,
 ) -> Sample:
-    """Return the training sample of ``num_wanted`` sweeps of a clip, from source to target index.
+    """Return the training sample of two sweeps of a clip, with all points of both.
 
-    With ``rng`` the sample is turned, mirrored, scaled and drawn at random.
+    Args:
+        source: Index of the source sweep in the clip.
+        target: Index of the target sweep, a neighbour of the source.
+        num_wanted: Number of sweeps that the network takes.
+        rng: Turns, mirrors, scales and draws the sample at random; None changes nothing.
     """
     source_sweep, target_sweep = clip[source], clip[target]
     augmentation = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
@@ -335,7 +341,7 @@ def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
 
 
 def objective_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the published objective for the drawn points of a sample, m² per point, 0-d."""
+    """Return the published objective of a sample's drawn points, m² per point, as 0-d tensor."""
     source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
     graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
     flow = predict(sample.sweeps)[sample.drawn]
@@ -344,7 +350,7 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d."""
+    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d tensor."""
     flow, true, moving = predict(sample.sweeps), sample.flow, sample.moving
     fast = true.norm(dim=1) >= _FAST_M_S * sample.duration_s
     # The gradient of the norm itself is not a number at 0.

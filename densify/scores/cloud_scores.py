@@ -19,7 +19,11 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
 
     At a ghost's position, all returns of the key sweep in its cell and the eight around it, at
     least six, are farther by more than max(0.5 m, 2 % of its range). Dark paint and glass hide
-    ghosts.
+    ghosts. Points of the key sweep and of sweeps beyond the window are False in both masks.
+
+    Args:
+        key_image: Range image of the key sweep.
+        key: Frame number of the key sweep.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     rows = np.flatnonzero(_others(cloud, key))
@@ -33,7 +37,7 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
 
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
-    """Return the share of `ghosts` among the points of the window's other sweeps, None for none."""
+    """Return the share of `ghosts` among the window's points of other sweeps, None without any."""
     return _mean(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
 
 

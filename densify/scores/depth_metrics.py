@@ -105,10 +105,11 @@ def precision_density(
 ) -> list[dict[str, float | None]]:
     """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
-    Each has ``min_confidence``, and for ``measured`` and ``filled`` depth: ``density_*``, share of
-    the pixels that keep a depth; ``outliers_*``, share of outliers among those with a true depth,
-    None for none; ``expected_*``, share of outliers that the confidence of the kept pixels
-    promises.
+    ``truth_m`` is (H,W) true depth in metres, 0 for none. ``camera`` gives the focal length. Each
+    dictionary has ``min_confidence``, and for ``measured`` and ``filled`` depth: ``density_*``,
+    share of the pixels that keep a depth; ``outliers_*``, share of outliers among those with a true
+    depth; ``expected_*``, share of outliers that the confidence of the kept pixels promises. The
+    latter two are None without such pixels.
     """
     curve = []
     for min_confidence in _LEAST_CONFIDENCES:
@@ -136,7 +137,8 @@ def errors_by_part(
     """Return `depth_errors` of parts of the pixels (H,W), by name of the part.
 
     The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
-    (``edge``), other pixels (``not edge``) and, given a mask, ``moving`` and ``static`` pixels.
+    (``edge``), other pixels (``not edge``) and, given the mask ``moving``, ``moving`` and
+    ``static`` pixels. Depths are metres, 0 for none.
     """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
@@ -191,7 +193,10 @@ def image_density(depth_m: Float32) -> float:
 def depth_scores(
     depth: DepthMap, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``."""
+    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``.
+
+    ``truth_depth_m`` (H,W) is in metres, 0 for none; ``moving_mask`` (H,W) is True if moving.
+    """
     return {
         product: scores_by_motion(image, truth_depth_m, moving_mask, camera)
         for product, image in (("measured", depth.depth_m), ("filled", depth.filled_m))
@@ -201,7 +206,7 @@ def depth_scores(
 def scores_by_motion(
     depth_m: Float32, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, Any]]:
-    """Return `depth_errors` of depths (H,W) as ``scores["all"|"moving"|"static"]``."""
+    """Return `depth_errors` of depths (H,W), metres, as ``scores["all"|"moving"|"static"]``."""
     masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
     return {
         group: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))

@@ -133,7 +133,10 @@ def depth_edges(points: Float) -> Silhouettes:
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
-    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image with a focal length."""
+    """Return the (2,h,w) gradients of an image at a focal length of 700 px, and its scale.
+
+    They are the `View.strength` and `View.scale` of an (H,W,3) RGB image.
+    """
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -151,7 +154,7 @@ def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, flo
 
 
 def turned(camera: Camera, offset: Float) -> Camera:
-    """Return the camera with its rotation corrected by an offset (4,), as in `Fit`."""
+    """Return the camera turned by pitch, yaw and roll (degrees) of an offset (4,), as in `Fit`."""
     turn = poses.exp(np.append(np.deg2rad(offset[:3]), np.zeros(3)))
     return replace(camera, T_cam_lidar=turn @ camera.T_cam_lidar)
 
@@ -185,9 +188,10 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best-fitting offset of a camera to two or more views, with a delay or without.
+    """Return the best-fitting offset of a camera to two or more views.
 
-    Among equal local maxima, the one that changes the fewest parameters is chosen.
+    ``with_clock`` fits the delay of the images too, otherwise it is 0. Among equal local maxima,
+    the one that changes the fewest parameters is chosen.
     """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]

@@ -37,7 +37,10 @@ def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> 
 
 
 def accuracy(estimated: Float, true: Float, limit: float) -> float:
-    """Return the share of points with an error below ``limit`` metres or times the true flow."""
+    """Return the share of points with an end-point error below a limit.
+
+    The limit is ``limit`` metres or, if larger, ``limit`` times the length of the true flow.
+    """
     error_m = end_point_errors(estimated, true)
     return mean_of((error_m < limit) | (error_m < limit * np.linalg.norm(true, axis=1)))
 
@@ -65,14 +68,20 @@ def challenge_scores(
 ) -> dict[str, Any]:
     """Score flow as the Argoverse 2 scene flow challenges do, within 35 m of the vehicle.
 
-    Points and flows (N,3) are metres, vehicle frame, without ground; ``classes`` indices in
-    `CLASSES` or `IGNORED`. ``three_way`` are mean errors in metres of moving objects (0.05 m a
-    sweep or more), of other objects, of the background, and the mean of the three (Chodosh,
-    Ramanan, Lucey, WACV 2024; the package av2). ``bucketed`` has, for each class with points and
-    MEAN, ``static_m``, the mean error in the first bucket of true flow, and ``dynamic``, the mean
-    over the others of error divided by true length (Khatri et al., "I Can't Believe It's Not Scene
-    Flow!", ECCV 2024; the package bucketed-scene-flow-eval). ``num_points`` is the number of scored
-    points.
+    Args:
+        points: (N,3) metres, vehicle frame, without ground.
+        estimated: (N,3) estimated flow in metres.
+        true: (N,3) true flow.
+        classes: (N,) indices in `CLASSES`, or `IGNORED`.
+
+    Returns:
+        ``three_way``: mean errors in metres of moving objects (0.05 m a sweep or more), of other
+            objects, of the static background, and the mean of the three (Chodosh, Ramanan, Lucey,
+            WACV 2024; the package av2). ``bucketed``: for each class with points and MEAN,
+            ``static_m``, the mean error in the first bucket of true flow, and ``dynamic``, the mean
+            over the others of error divided by true length (Khatri et al., "I Can't Believe It's
+            Not Scene Flow!", ECCV 2024; the package bucketed-scene-flow-eval). ``num_points``:
+            number of scored points.
     """
     scored = np.abs(points[:, :2]).max(axis=1, initial=0) < _WITHIN_M
     scored &= classes < len(CLASSES)

@@ -37,10 +37,10 @@ def window_pose_errors(
 class RecordedError(NamedTuple):
     """Error of recorded motions against odometry."""
 
-    m: float  # median translation error
-    deg: float  # median rotation error
+    m: float  # median translation error in metres
+    deg: float  # median rotation error in degrees
     cost: float  # the larger error, as a multiple of its tolerance
-    way_m: float  # longest motion
+    way_m: float  # length of the longest motion by odometry
 
     @staticmethod
     def of(recorded: Sequence[Float], odometry: Sequence[Float]) -> RecordedError:
@@ -58,9 +58,9 @@ class RecordedError(NamedTuple):
 def main_error(
     recorded: Sequence[Float], odometry: Sequence[Float], duration_s: float
 ) -> tuple[str, str]:
-    """Return a clause about the main error of recorded motions, and one about its correction.
+    """Return a clause about the main error of recorded motions (4,4), and one about its correction.
 
-    The error is scale or drift over ``duration_s``; the correction is "" if there is none.
+    The error is a scale, or a drift over ``duration_s``. Without correction, that clause is "".
     """
     recorded_m, odometry_m = (
         np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)

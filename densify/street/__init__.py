@@ -11,7 +11,7 @@ import yaml
 
 
 def read_table(name: str) -> Any:
-    """Return the data of ``NAME.yaml`` in this folder; mappings become objects with attributes."""
+    """Return the content of ``NAME.yaml`` in this folder; keys of mappings become attributes."""
     text = Path(__file__).with_name(f"{name}.yaml").read_text("utf-8")
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in C is 10 times faster
     return _record(yaml.load(text, loader))

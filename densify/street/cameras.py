@@ -86,12 +86,12 @@ USUAL = ("image_02", "image_03")
 
 
 def T_level_lidar(tilt_deg: float) -> Float:
-    """Return the (4,4) pose of a lidar with a tilted mount in the frame of a level mount."""
+    """Return the (4,4) pose of a lidar tilted nose down in the frame of a level lidar."""
     return inverse(T_ego_lidar()) @ T_ego_lidar(tilt_deg)
 
 
 def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str, Camera]:
-    """Return the cameras, which do not tilt, with poses relative to the tilted lidar."""
+    """Return name -> camera, which is level, with its pose relative to the tilted lidar."""
     T = T_level_lidar(tilt_deg)
     cameras = {name: CAMERAS[name] for name in names}
     return {
@@ -102,7 +102,7 @@ def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str,
 
 @dataclass(frozen=True)
 class Picture:
-    """One exposure of (H,W) pixels."""
+    """One exposure of a camera with (H,W) pixels."""
 
     image: NDArray[np.uint8]  # (H,W,3) uint8 RGB
     # (H,W) float32 depth of the nearest surface, glass included, by the camera's ``measure``. 0 for
@@ -114,7 +114,12 @@ class Picture:
 def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture:
     """Render the picture of a camera with a rolling shutter: each row at its own time.
 
-    Camera poses are relative to a level lidar; the middle row is at ``time_s`` since frame 0.
+    Pixels outside the view of the lens are black, with depth 0 and body -1.
+
+    Args:
+        ego: Motion of the ego vehicle.
+        camera: Camera whose pose is relative to a lidar on a level mount.
+        time_s: Exposure of the middle row, in seconds since frame 0.
     """
     h, w = camera.height_px, camera.width_px
     v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)

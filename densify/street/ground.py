@@ -33,7 +33,7 @@ _PAINT_M = 0.006  # height of paint over the road
 class Road:
     """A road: a strip that extends ``left_m`` and ``right_m`` metres from its centreline."""
 
-    curve: Curve
+    curve: Curve  # centreline
     left_m: float
     right_m: float
 
@@ -44,7 +44,7 @@ class Road:
         return stations, cKDTree(self.curve(stations))
 
     def distance(self, xy: Float) -> Float:
-        """Return (N,) signed metres to the edge of the strip, negative on the road."""
+        """Return the (N,) metres from (N,2) points, world, to the strip's edge, negative inside."""
         stations, tree = self._samples
         station = stations[tree.query(xy)[1]]
         for _ in range(_NUM_STEPS):  # from the nearest sample to the foot of the perpendicular
@@ -61,13 +61,13 @@ class Road:
 class Ground:
     """Terrain with roads on it."""
 
-    terrain: Terrain
-    roads: tuple[Road, ...]
+    terrain: Terrain  # bare ground
+    roads: tuple[Road, ...]  # roads, whose strips together are the carriageway
     kerb_m: float  # height of the kerb, by which everything outside the roads is raised
     pavement_m: float  # width of the pavement beside the roads
 
     def distance(self, xy: Float) -> Float:
-        """Return (N,) signed metres to the kerb, negative on the carriageway."""
+        """Return the (N,) metres from (N,2) points, world, to the kerb, negative on the road."""
         # Union of the strips with rounded inner corners, as signed distance fields are joined
         distance = self.roads[0].distance(xy)
         radius_m = _CORNER_RADIUS_M
@@ -79,11 +79,11 @@ class Ground:
         return distance
 
     def height(self, xy: Float) -> Float:
-        """Return (N,) heights in metres of the surface, kerbs included."""
+        """Return the (N,) heights in metres of the surface at (N,2) points, kerbs included."""
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float) -> Mesh:
-        """Return the mesh: cells of ``cell_m`` within ``margin_m`` of roads, 8 m elsewhere."""
+        """Return the mesh: cells of ``cell_m`` within ``margin_m`` of roads, of 8 m elsewhere."""
         centre = np.concatenate([road.curve(road.curve.knots_m) for road in self.roads])
         low = centre.min(axis=0) - margin_m - _BORDER_M
         high = centre.max(axis=0) + margin_m + _BORDER_M
@@ -171,12 +171,12 @@ class Side:
     """One side (+1 left, -1 right) of a road between two stations (arc lengths)."""
 
     road: Road
-    side: int
-    begin_m: float
-    end_m: float
+    side: int  # 1 on the left of the centreline, -1 on the right
+    begin_m: float  # first station
+    end_m: float  # last station
 
     def at(self, station_m: float, beyond_kerb_m: float) -> Float:
-        """Return the (2,) point beside a station, ``beyond_kerb_m`` outside the kerb."""
+        """Return the (2,) point, metres, world, ``beyond_kerb_m`` outside the kerb at a station."""
         station = np.array([station_m])
         edge_m = self.road.left_m if self.side > 0 else self.road.right_m
         normal = self.road.curve.normal(station)[0] * self.side
@@ -184,18 +184,22 @@ class Side:
         return point
 
     def heading(self, station_m: float) -> float:
-        """Return the heading (rad) at which the +y axis of a mesh points away from the road."""
+        """Return the heading (rad) of a mesh whose -y axis points to the road at a station."""
         forward = self.forward(station_m)
         return float(np.arctan2(-forward[1], -forward[0]))
 
     def forward(self, station_m: float) -> Float:
-        """Return the (2,) direction of the traffic on this side. Traffic keeps to the right."""
+        """Return the (2,) unit vector, world, of this side's traffic, which keeps to the right."""
         tangent: Float = self.road.curve.tangent(np.array([station_m]))[0] * -self.side
         return tangent
 
 
 def mark_road(ground: Ground, road: Road, row: Any, spans: Spans) -> Mesh:
-    """Return the painted lines of a row of ``markings``, at the arc lengths ``spans`` (m)."""
+    """Return the mesh of the painted lines on a road.
+
+    ``row`` is a row of ``markings`` in scenes.yaml. ``spans`` has the [begin, end] of each painted
+    part, as arc lengths in metres.
+    """
     dashes = [
         (station, station + _DASH_M)
         for begin, end in spans

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Simulate sweeps of the lidars in lidars.yaml: every pulse, and what comes back from it.
 
-A scan pattern has ``num_pulses(period_s)`` and ``directions(number, share, time_s)``: unit vectors
-(N,3) in the scanner's axes, by index, firing time in periods about the reference time (-0.5 to
-0.5), and firing time in seconds since frame 0.
+A scan pattern has the methods ``num_pulses`` and ``directions`` of `Spinning`.
 """
 
 from __future__ import annotations
@@ -46,11 +44,17 @@ class Spinning:
     phase: float = 0.0  # lead in turns over a scanner that faces forward at the reference time
 
     def num_pulses(self, period_s: float) -> int:
-        """Return the number of pulses in a sweep."""
+        """Return the number of pulses in a sweep that takes ``period_s`` seconds."""
         return int(self.columns_per_s * period_s + _ROUNDING) * len(self.elevation_deg)
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the (N,3) unit vectors of pulses; the module describes the arguments."""
+        """Return the (N,3) unit vectors of pulses in the scanner's axes: x forward, y left, z up.
+
+        Args:
+            number: (N,) index of each pulse in its sweep.
+            share: (N,) firing time since the reference time, in periods, from -0.5 to 0.5.
+            time_s: (N,) firing time in seconds since frame 0.
+        """
         azimuth = -2 * np.pi * (share + self.phase)
         beam = number % len(self.elevation_deg)
         return _pointing(azimuth, np.radians(self.elevation_deg)[beam])
@@ -77,7 +81,7 @@ class Raster(_Steady):
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the (N,3) unit vectors of pulses; the module describes the arguments."""
+        """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
         line = number * (self.lines_per_s / self.pulses_per_s)
         swing = 1 - np.abs(line % 2 - 1)  # from 0 to 1 in one line, back to 0 in the next
         azimuth = np.radians(self.width_deg) * (0.5 - swing)
@@ -94,7 +98,7 @@ class Rosette(_Steady):
     turns_per_s: tuple[float, float]
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return the (N,3) unit vectors of pulses; the module describes the arguments."""
+        """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
         first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
         axis_angle = np.radians(self.width_deg / 2) * np.cos(first - second)
         roll = first + second
@@ -125,11 +129,11 @@ class Scanner:
 class Sensor:
     """One or several scanners whose returns form one sweep."""
 
-    name: str
-    scanners: tuple[Scanner, ...]
+    name: str  # key of `SENSORS`
+    scanners: tuple[Scanner, ...]  # a return's scanner is an index into these
 
     def each(self, field: str) -> Float:
-        """Return the values of the named field of all S scanners, (S,) or (S,3)."""
+        """Return the values of the named field of all S scanners, as an array (S,) or (S,3)."""
         return np.array([getattr(scanner, field) for scanner in self.scanners], np.float64)
 
     @property
@@ -224,7 +228,7 @@ _RARE = 1e-9  # least probability that is converted to a normal quantile
 
 
 def laser(world: World, luck: Float) -> Optics:
-    """Return the optics of lidar."""
+    """Return the optics of lidar; ``luck`` (N,) has a random number from 0 to 1 for each ray."""
     surfaces = world.triangles
 
     def optics(met: Meeting) -> Int:
@@ -268,7 +272,7 @@ def _decide_at_shell(outcome: Int, world: World, met: Meeting, rows: Int) -> Non
 
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
-    """Return the (N,) shares of pulses lost; ``tint`` (N,) are factors on the reflectivity."""
+    """Return the (N,) shares of pulses lost, by (N,) materials, tint factors and ranges (m)."""
     table = _TABLES.lost_elsewhere
     ground, dark, bright = (
         np.interp(range_m, table.range_m, shares)
@@ -280,7 +284,10 @@ def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
 
 
 def patches(position: Float, owner: Int) -> Float:
-    """Return (N,) random numbers, 0 to 1, smooth over the surface (N,3), metres, of each object."""
+    """Return (N,) random numbers from 0 to 1 that vary smoothly over the surface of an object.
+
+    ``position`` (N,3) has points in metres, ``owner`` (N,) the numbers of their objects.
+    """
     # Normal random numbers at the corners of a grid of cells are interpolated.
     cell = np.floor(position / _PATCH_M)
     share = position / _PATCH_M - cell
@@ -341,7 +348,7 @@ class Returns:
 
 
 def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
-    """Return the (4,4) pose of the lidar frame on the vehicle, tilted nose down."""
+    """Return the (4,4) pose of the lidar frame on the vehicle, tilted nose down by ``tilt_deg``."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("y", tilt_deg, degrees=True).as_matrix()
     T[2, 3] = LIDAR_HEIGHT_M
@@ -351,14 +358,17 @@ def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
 class Mount(NamedTuple):
     """A sensor on the ego vehicle."""
 
-    ego: Driving
+    ego: Driving  # motion of the vehicle
     sensor: Sensor
-    period_ns: int = 100_000_000  # of the sweeps
-    tilt_deg: float = 0.0  # pitch, nose down
+    period_ns: int = 100_000_000  # duration of a sweep
+    tilt_deg: float = 0.0  # pitch of the sensor, nose down
 
 
 def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) -> Returns:
-    """Simulate a mounted sensor's sweep whose middle is ``time_s``, in seconds since frame 0."""
+    """Return the simulated returns of a mounted sensor's sweep; ``rng`` draws noise and losses.
+
+    The middle of the sweep is at ``time_s``, in seconds since frame 0.
+    """
     sensor = mount.sensor
     T = T_ego_lidar(mount.tilt_deg)
     fired = firings(sensor, time_s, mount.period_ns)
@@ -408,7 +418,7 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
 
 
 def at_offsets(time_s: float, offset_ns: Int) -> Float:
-    """Return (N,) times in seconds from (N,) offsets in ns and a reference time in seconds."""
+    """Return the (N,) times in seconds at (N,) offsets in ns from a reference time in seconds."""
     times: Float = np.asarray(time_s + offset_ns * _S_PER_NS, dtype=np.float64)
     return times
 

@@ -70,7 +70,7 @@ class Mesh:
 
     @staticmethod
     def join(meshes: Sequence[Mesh]) -> Mesh:
-        """Return the union of several meshes."""
+        """Return the union of meshes. At least one of them must have a triangle."""
         meshes = [mesh for mesh in meshes if len(mesh.triangles)]
         columns = {
             field.name: np.concatenate([getattr(mesh, field.name) for mesh in meshes])
@@ -84,7 +84,10 @@ class Mesh:
 
     @staticmethod
     def quads(corners: Float, material: Material, tint: Tint | Float = WHITE) -> Mesh:
-        """Return a mesh of quads (K,4,3), metres, in order around; texture x is the first side."""
+        """Return a mesh of quads (K,4,3), metres, corners in order around, without object numbers.
+
+        Texture x is along the first side. ``tint`` is (3,) for all quads or (K,3).
+        """
         num = len(corners)
         first_side = corners[:, 1] - corners[:, 0]
         last_side = corners[:, 3] - corners[:, 0]
@@ -107,21 +110,21 @@ class Mesh:
         return replace(self, vertices=self.vertices + offset)
 
     def posed(self, T_a_mesh: Float) -> Mesh:
-        """Return the mesh in frame a, for the (4,4) pose of the mesh in that frame."""
+        """Return the mesh in frame a, where ``T_a_mesh`` (4,4) is the pose of its present frame."""
         return replace(self, vertices=self.vertices @ T_a_mesh[:3, :3].T + T_a_mesh[:3, 3])
 
     def of_instance(self, instance: int) -> Mesh:
-        """Return the mesh with all triangles assigned to this object number."""
+        """Return the mesh with this object number for all of its triangles."""
         return replace(self, instance=np.full(len(self.triangles), instance, np.int32))
 
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
-        """Return the lowest and the highest corner, (3,) each."""
+        """The lowest and the highest coordinates of the vertices, (3,) each, in metres."""
         return self.vertices.min(axis=0), self.vertices.max(axis=0)
 
 
 def box(low: Point | Float, high: Point | Float, material: Material, tint: Tint = WHITE) -> Mesh:
-    """Return an upright box between two corners (3,) in metres; (K,3) corners make K boxes."""
+    """Return the mesh of upright boxes between two opposite corners, (3,) or (K,3), in metres."""
     # For each corner of each side: 1 where x, y, z are those of the highest corner of the box
     is_high = np.array(
         [
@@ -142,7 +145,7 @@ def box(low: Point | Float, high: Point | Float, material: Material, tint: Tint 
 def frustum(
     low: Point, high: Point, material: Material, tint: Tint = WHITE, taper: Point = (1.0, 1.0)
 ) -> Mesh:
-    """Return a box from ``low`` to ``high`` (3,), metres, its top scaled by ``taper`` in x, y."""
+    """Return a box between two corners (3,), metres, whose top is scaled by ``taper`` in x, y."""
     lowest, highest = np.asarray(low, float), np.asarray(high, float)
     middle = (lowest + highest)[:2] / 2
     half = (highest - lowest)[:2] / 2
@@ -163,7 +166,10 @@ def tube(
     tint: Tint = WHITE,
     num_sides: int = 8,
 ) -> Mesh:
-    """Return a closed cylinder or cone between two points, with one radius or one at each end."""
+    """Return a closed cylinder or cone along the line from ``start`` (3,) to ``end`` (3,), metres.
+
+    ``radius_m`` is one radius for both ends, or the radii at start and end.
+    """
     a, b = np.asarray(start, float), np.asarray(end, float)
     start_radius_m, end_radius_m = np.broadcast_to(radius_m, 2)
     # Two unit vectors u and v span the plane of the rings.
@@ -184,7 +190,7 @@ def tube(
 
 
 def ball(centre: Point, radius_m: Point, material: Material, tint: Tint = WHITE) -> Mesh:
-    """Return an ellipsoid of 6 rings and 10 sectors with radii along x, y and z."""
+    """Return an ellipsoid of 6 rings and 10 sectors with the radii (3,) along x, y and z."""
     latitude, longitude = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, 6 + 1), np.linspace(0, 2 * np.pi, 10 + 1), indexing="ij"
     )
@@ -198,7 +204,7 @@ def ball(centre: Point, radius_m: Point, material: Material, tint: Tint = WHITE)
 
 
 def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint = WHITE) -> Mesh:
-    """Return squares at ``centres`` (K,3), metres, turned at random, each a bunch of leaves."""
+    """Return randomly turned squares at ``centres`` (K,3), metres, each a bunch of leaves."""
     num = len(centres)
     # Unit vectors along the sides of each square
     u = rng.normal(size=(num, 3))
@@ -212,7 +218,7 @@ def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint =
 
 
 def across(a: Float, b: Float) -> Float:
-    """Return (...,3) cross products of (...,3) vectors; faster than np.cross."""
+    """Return the (...,3) cross products of vectors (...,3), faster than np.cross."""
     product = np.empty(a.shape)
     for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         np.subtract(a[..., i] * b[..., j], a[..., j] * b[..., i], out=product[..., axis])
@@ -220,7 +226,7 @@ def across(a: Float, b: Float) -> Float:
 
 
 def lengths(vectors: Float) -> Float:
-    """Return (N,1) lengths of (N,3) vectors; faster than np.linalg.norm."""
+    """Return the (N,1) lengths of vectors (N,3), faster than np.linalg.norm."""
     squared = vectors * vectors
     return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
 
@@ -232,7 +238,7 @@ _DOUBLE_BITS = 53
 
 
 def noise(i: Int, j: Int) -> Float:
-    """Return (N,) repeatable random numbers in [0, 1), a hash of two (N,) integer arrays."""
+    """Return (N,) random numbers in [0, 1), always the same for the same integers, (N,) each."""
     h = i.astype(np.uint64) * _PRIMES[0]
     h ^= j.astype(np.uint64) * _PRIMES[1]
     h ^= h >> np.uint64(29)

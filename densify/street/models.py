@@ -53,7 +53,7 @@ class Actor:
 
 @lru_cache(_CACHED_MODELS)
 def model(name: str, **parameters: Any) -> Mesh:
-    """Return a model of models.yaml; ``parameters`` gives values to the names its rows use."""
+    """Return a mesh of models.yaml; ``parameters`` are values of the names that its rows use."""
     return Mesh.join([_solid(solid, parameters) for solid in getattr(_SHAPES, name)])
 
 
@@ -143,7 +143,7 @@ _SOLIDS: dict[str, Callable[..., Mesh]] = {
 
 
 def parked_car(instance: int, rng: np.random.Generator) -> Mesh:
-    """Return a car of random paint and shape, with this object number."""
+    """Return the mesh of a car of random paint and shape, with this object number."""
     return car_mesh(_random_paint(rng), rng).of_instance(instance)
 
 
@@ -170,12 +170,12 @@ def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
 
 
 def car(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
-    """Return a driving car."""
+    """Return a driving car of random paint and shape, with this object number."""
     return Actor("car", (Body(car_mesh(_random_paint(rng), rng), motion, instance),))
 
 
 def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
-    """Return a 16 m articulated truck. The trailer follows the tractor through turns."""
+    """Return a 16 m articulated truck whose trailer follows the tractor through turns."""
     cab = model("truck_cab", paint=_random_paint(rng))
     load = model("truck_load", tarpaulin=_random_cloth(rng))
     towed = Towed(motion, _SHAPES.truck.kingpin_m, WHEELBASE_M["trailer"], *SPAN_S)
@@ -233,7 +233,7 @@ def _spoked_wheel(row: Any, x_m: float) -> list[Mesh]:
 
 
 def house(rng: np.random.Generator, width_m: float, depth_m: float) -> Mesh:
-    """Return a house with its front along x, facing -y: walls, windows, door and gable roof."""
+    """Return a house around the origin, ``width_m`` along x, ``depth_m`` along y, facing -y."""
     shape = _SHAPES.house
     storeys = int(rng.integers(*shape.num_storeys))
     height = shape.storey_m * storeys + shape.attic_m

@@ -35,14 +35,14 @@ class Curve:
         self._slope = self._spline.derivative()
 
     def __call__(self, station_m: Float) -> Float:
-        """Return (N,2) points at (N,) arc lengths."""
+        """Return the (N,2) points of the curve in metres at (N,) arc lengths in metres."""
         inside = np.clip(station_m, 0.0, self.length_m)
         if np.array_equal(inside, station_m):  # the tangent is not needed
             return self._spline(inside)
         return self.with_tangent(station_m)[0]
 
     def with_tangent(self, station_m: Float) -> tuple[Float, Float]:
-        """Return the points (N,2) of the curve at (N,) arc lengths, and its `tangent` there."""
+        """Return the (N,2) points of the curve at (N,) arc lengths, and its `tangent` there."""
         inside = np.clip(station_m, 0.0, self.length_m)
         tangent = self.tangent(inside)
         return self._spline(inside) + (station_m - inside)[..., None] * tangent, tangent
@@ -62,7 +62,10 @@ class Curve:
     def bending(
         length_m: float, curvature: Callable[[Float], Float], origin_m: float = 0.0
     ) -> Curve:
-        """Return the curve of a curvature (1/m, left positive) through the origin along +x."""
+        """Return a curve of ``length_m`` through the origin along +x, at arc length ``origin_m``.
+
+        ``curvature`` maps (N,) arc lengths to (N,) curvatures in 1/m, positive to the left.
+        """
         step = _FINE_M
         station = np.arange(0.0, length_m + step, step)
         heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
@@ -77,7 +80,7 @@ class Curve:
 
 
 def left_of(forward: Float) -> Float:
-    """Return (...,2) vectors turned to the left by a right angle."""
+    """Return the vectors (...,2) turned to the left by a right angle."""
     return np.stack([-forward[..., 1], forward[..., 0]], axis=-1)
 
 
@@ -93,12 +96,12 @@ class Lane:
         self._stations = stations
 
     def at(self, station_m: float) -> float:
-        """Return the arc length on this lane beside a station (arc length) of the road."""
+        """Return the arc length (m) on this lane beside a station (arc length in m) of the road."""
         return float(np.interp(station_m, self._stations, self._abreast_m))
 
 
 def polyline(corners: Sequence[Float | tuple[float, float]], radius_m: float) -> Float:
-    """Return (N,2) points, half a metre apart, along straight lines with rounded corners."""
+    """Return (N,2) points, half a metre apart, along lines with corners rounded to ``radius_m``."""
     pieces = [np.asarray(corners[0], float)[None]]
     for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
         pieces.append(_rounded_corner(before, corner, after, radius_m))
@@ -140,7 +143,7 @@ class Speed:
         self._travelled = np.concatenate([[0.0], np.cumsum(steps)])
 
     def distance(self, times_s: Float) -> Float:
-        """Return (N,) metres travelled since the first knot at (N,) seconds, negative before it."""
+        """Return the (N,) metres travelled since the first knot at (N,) seconds, below 0 before."""
         last = len(self._t) - 1
         before = np.clip(np.searchsorted(self._t, times_s, side="right") - 1, 0, last)
         after = np.minimum(before + 1, last)
@@ -189,15 +192,15 @@ class Poses(NamedTuple):
     position: Float  # (N,3) metres
 
     def apply(self, points: Float) -> Float:
-        """Return (N,3) points of the body frames in world coordinates, each by its own pose."""
+        """Return the points (N,3) of the body frames in world coordinates, each by its own pose."""
         return self.turn(points) + self.position
 
     def undo(self, points: Float) -> Float:
-        """Return (N,3) world points in body coordinates, each by its own pose."""
+        """Return the world points (N,3) in coordinates of the bodies, each by its own pose."""
         return np.einsum("nji,nj->ni", self.rotation, points - self.position)
 
     def turn(self, directions: Float) -> Float:
-        """Return (N,3) directions of the body frames in world axes, each by its own pose."""
+        """Return the directions (N,3) of the body frames in world axes, each by its own pose."""
         return np.einsum("nij,nj->ni", self.rotation, directions)
 
     def rows(self, rows: Int) -> Poses:
@@ -262,12 +265,12 @@ class Driving:
     upright: bool = False  # stay vertical on slopes, as a pedestrian does
 
     def station(self, times_s: Float) -> Float:
-        """Return (N,) arc lengths along the curve at (N,) seconds."""
+        """Return the (N,) arc lengths along the curve, in metres, at (N,) seconds since frame 0."""
         travelled = self.speed.distance(times_s) - self.speed.distance(np.array([self.at_s]))
         return self.station_m + travelled
 
     def poses(self, times_s: Float) -> Poses:
-        """Return N poses at (N,) seconds."""
+        """Return the N poses of the vehicle at (N,) seconds since frame 0."""
         station = self.station(times_s)
         half = self.wheelbase_m / 2
         rear, front = self.curve(station - half), self.curve(station + half)
@@ -307,8 +310,11 @@ class Towed:
         """Compute the path of the axle.
 
         Args:
+            tractor: Motion of the tractor.
             kingpin_m: Position of the kingpin on the x axis of the tractor.
             wheelbase_m: Distance from the kingpin to the axle of the trailer.
+            first_s: Begin of the computed path, in seconds since frame 0.
+            last_s: End of the path.
         """
         self._tractor = tractor
         self._kingpin_m = kingpin_m
@@ -328,7 +334,7 @@ class Towed:
         return (tractor.position + tractor.rotation[:, :, 0] * self._kingpin_m)[:, :2]
 
     def poses(self, times_s: Float) -> Poses:
-        """Return N poses at (N,) seconds. The origin is below the middle of the wheelbase."""
+        """Return the N poses at (N,) seconds since frame 0, below the middle of the wheelbase."""
         lift = np.zeros(len(times_s))
         return on_ground(self._tractor.terrain, self._axle(times_s), self._pin(times_s), lift)
 
@@ -345,7 +351,7 @@ class Limb:
     phase: float  # phase of the swing in rad
 
     def poses(self, times_s: Float) -> Poses:
-        """Return N poses at (N,) seconds."""
+        """Return the N poses of the limb at (N,) seconds since frame 0."""
         parent = self.parent.poses(times_s)
         walked = self.parent.station(times_s)
         angle = self.swing * np.sin(2 * np.pi * walked / self.stride_m + self.phase)
@@ -363,7 +369,7 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """Return a mesh's footprints from above at N poses, wider by ``slack_m`` on each side."""
+        """Return a mesh's footprints at N poses, wider by ``slack_m`` on each side."""
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
@@ -378,12 +384,12 @@ class Rectangles(NamedTuple):
         return Rectangles(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 
     def rows(self, rows: Int | None) -> Rectangles:
-        """Return the rectangles with these indices along the first axis, None for a new axis."""
+        """Return the rectangles with these indices along the first axis; None adds an axis."""
         return Rectangles(*(column[rows] for column in self))
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
-    """Return (...) True for pairs of rectangles that touch; leading shapes are broadcast."""
+    """Return a mask, True for pairs of rectangles that touch; leading shapes are broadcast."""
     # Two rectangles are apart if the direction of a side separates them (separating axes): along
     # it, their centres are farther apart than the sum of their half extents.
     between = b.centre - a.centre

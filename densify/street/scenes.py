@@ -40,15 +40,15 @@ _CONVOY_VARIES = 0.2  # share by which the gaps of a convoy vary
 class Scene:
     """A world and its moving actors."""
 
-    world: World
+    world: World  # all bodies except the ego vehicle
     ground: Ground
-    ego: Driving
+    ego: Driving  # motion of the ego vehicle
     actors: tuple[Actor, ...]
     footprints: Rectangles  # rectangles of the static objects that traffic must not touch
 
 
 def build(preset: str, rng: np.random.Generator) -> Scene:
-    """Build a scene at random; ``preset`` is a key of `PRESETS`."""
+    """Return a random scene; ``preset`` is a key of `PRESETS`, and ``rng`` is advanced."""
     table = PRESETS[preset]
     has_traffic = preset != "static"
 
@@ -184,12 +184,9 @@ class Scenery:
         self._num_parked = 0
 
     def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
-        """Place a mesh on the ground.
+        """Place a mesh on the ground at ``xy`` (2,), world, turned by a heading (rad) about z.
 
-        Args:
-            xy: (2,) position, world.
-            heading: Rotation about z in rad.
-            solid: Part of the mesh that traffic must not touch; None for all of it.
+        ``solid`` is the part of the mesh that traffic must not touch, None for the whole mesh.
         """
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
         self._stand(mesh, upright((*xy, z), heading), solid or mesh)
@@ -200,7 +197,7 @@ class Scenery:
         self.footprints.append(Rectangles.of(solid, pose))
 
     def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
-        """Return True if a mesh is clear of all objects, and ``kerb_gap_m`` from the kerb."""
+        """Return True if a mesh is 0.3 m from all objects, and ``kerb_gap_m`` from the kerb."""
         outline = Rectangles.of(mesh, upright((*xy, 0.0), heading), _CLEAR_M)
         if self.footprints:
             self.footprints = [Rectangles.joined(self.footprints)]
@@ -215,12 +212,12 @@ class Scenery:
     def put_if_free(
         self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float, solid: Mesh | None = None
     ) -> None:
-        """Place the mesh if `is_free` of its solid part is True, else leave it out."""
+        """Place a mesh as `put` does, but only if its solid part `is_free`."""
         if self.is_free(solid or mesh, xy, heading, kerb_gap_m):
             self.put(mesh, xy, heading, solid)
 
     def park(self, xy: Float, forward: Float) -> None:
-        """Place a parked car of random shape at ``xy`` (2,), along ``forward`` (2,), world."""
+        """Place a random parked car at ``xy`` (2,), world, along the direction ``forward`` (2,)."""
         mesh = models.parked_car(FIRST_PARKED + self._num_parked, self.rng)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2
@@ -236,9 +233,9 @@ class Scenery:
 
         Args:
             make: Function that returns a panel of a given length (m).
-            start: (2,) begin of the line, world.
+            start: (2,) begin of the line in metres, world.
             end: (2,) end of the line.
-            kerb_gap_m: Panels nearer to the kerb are left out.
+            kerb_gap_m: Least distance to the kerb. Panels nearer to it are left out.
         """
         length = float(np.linalg.norm(end - start))
         num_panels = max(1, round(length / _TABLES.plots.panel_m))
@@ -433,6 +430,7 @@ class Traffic:
         """Start without actors.
 
         Args:
+            scenery: Static objects, which actors must not touch.
             lanes: Rows of ``lanes`` in scenes.yaml, by name.
             curves: Curves of the roads, by name.
         """
@@ -447,7 +445,7 @@ class Traffic:
         self._moving = outline.rows(None)
 
     def add_row(self, journey: Journey, stations: Mapping[str, float]) -> None:
-        """Add the actor or the convoy of a journey; ``stations`` are arc lengths (m) by name."""
+        """Add a journey's actor or convoy, if it fits; ``stations`` are arc lengths (m) by name."""
         station = resolve(journey.station, stations)
         if journey.gap_m is None:
             self._add(partial(self._draw, journey, station, self._speed(journey)))

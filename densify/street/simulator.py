@@ -22,7 +22,7 @@ from densify.street.world import Body
 
 @lru_cache(maxsize=2)
 def build_scene(preset: str, seed: int) -> Scene:
-    """Return the scene of a preset and seed, always the same one. Building takes 1 to 2 s."""
+    """Return the scene of a preset and seed, the same for the same arguments, in 1 to 2 s."""
     return build(preset, np.random.default_rng([seed, 0]))
 
 
@@ -48,7 +48,7 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Return the truth of a sweep's N points; ``instance`` (N,) are their object numbers."""
+        """Return the truth of a sweep's points, as in `place`, of the objects ``instance`` (N,)."""
         T_world_lidar = self.T_world_lidar[frame]
         from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
         return SweepTruth(
@@ -58,7 +58,11 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """Return the true flow (N,3), metres, ego-motion removed, lidar frame of ``frame``."""
+        """Return the true flow (N,3), metres, of the points of `place` to the time of ``target``.
+
+        It is in the lidar frame of ``frame``, ego-motion removed. An unknown target raises
+        InputError.
+        """
         self.check(target)
         after = self.place(target, body, points)
         before = self.place(frame, body, points)
@@ -83,7 +87,7 @@ _MOVING_M, _MOVING_S = 0.05, 0.5  # an object moves if it goes this far in this 
 class Simulator:
     """A scene with a sensor. Its fields and the frame number determine all random values."""
 
-    preset: str
+    preset: str  # key of `densify.street.scenes.PRESETS`
     seed: int
     sensor: Sensor
     # Sweeps per second, such as 5, 10 or 20. The period is a whole number of nanoseconds. The scene
@@ -93,7 +97,7 @@ class Simulator:
 
     @property
     def period_ns(self) -> int:
-        """The time from sweep to sweep."""
+        """The time from sweep to sweep in nanoseconds."""
         return _NS_PER_S // self.hz
 
     @property
@@ -102,7 +106,7 @@ class Simulator:
         return DURATION_S * self.hz
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a frame's sweep."""
+        """Return the reference time of a frame's sweep, in nanoseconds since 1970."""
         return EPOCH_NS + frame * self.period_ns
 
     @cached_property
@@ -111,7 +115,7 @@ class Simulator:
         return build_scene(self.preset, self.seed)
 
     def returns(self, frame: int) -> Returns:
-        """Simulate the sweep of a frame."""
+        """Return the returns of the simulated sweep of a frame."""
         rng = np.random.default_rng([self.seed, 1, frame])
         time_s = seconds(self.stamp_ns(frame))
         mount = Mount(self.scene.ego, self.sensor, self.period_ns, self.tilt_deg)
@@ -131,7 +135,7 @@ class Simulator:
         return expose(self.scene.world, self.scene.ego, CAMERAS[camera], time_s)
 
     def T_world_lidar_at(self, time_ns: int) -> Float:
-        """Return the (4,4) pose of the lidar frame in the world at an absolute time."""
+        """Return the (4,4) pose of the lidar frame in the world at a time in ns since 1970."""
         T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrix()
         return T_world_ego @ T_ego_lidar(self.tilt_deg)
 
@@ -141,7 +145,10 @@ class Simulator:
         return self.bodies_at([self.stamp_ns(frame) for frame in range(self.num_frames)])
 
     def bodies_at(self, stamps_ns: Sequence[int], indices: Sequence[int] | None = None) -> Bodies:
-        """Return the poses of bodies at these times; an object's bodies are selected together."""
+        """Return the poses of bodies at F times, in nanoseconds since 1970.
+
+        ``indices`` selects bodies, None for all. Bodies of one object must be selected together.
+        """
         times = np.array([seconds(stamp) for stamp in stamps_ns])
         bodies = self.scene.world.bodies
         if indices is not None:
@@ -158,7 +165,7 @@ class Simulator:
         )
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
-        """Return the (N,3) measured points, each in the frame of the body it was measured on."""
+        """Return the (N,3) measured points, each in the frame of the body that the ray hit."""
         # Poses at the firing time of each point take it to the world, and from there to its body.
         times = at_offsets(seconds(self.stamp_ns(frame)), returns.offset_ns)
         points = transform(T_ego_lidar(self.tilt_deg), returns.points.astype(np.float64))

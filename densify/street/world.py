@@ -66,7 +66,7 @@ class Meeting(NamedTuple):
     passed: NDArray[np.int32]
 
     def positions(self, rows: Int) -> Float:
-        """Return the (R,3) positions of some rays' ends (R,) in the body's frame."""
+        """Return the (R,3) points, metres, frame of the body, where some rays (R,) meet it."""
         return self.origin[rows] + self.distance_m[rows, None] * self.direction[rows]
 
 
@@ -111,8 +111,10 @@ class Triangles:
     ) -> tuple[Int, Int, Float]:
         """Return rays (K,) with a hit on their body, their first triangles (K,), and u and v (K,2).
 
-        ``spans`` are each body's index and the end of its rays, ascending. ``origin`` (N,3) and
-        ``direction`` (N,3), unit vectors, are in the frame of the body.
+        Args:
+            spans: Index of each body, and the end of its rays in the arrays below, ascending.
+            origin: (N,3) origins in metres, in the frame of the body.
+            direction: (N,3) unit vectors in that frame.
         """
         start = origin.astype(np.float32)
         ray = direction.astype(np.float32)
@@ -149,6 +151,7 @@ class World:
 
         Args:
             rays: N rays in the world.
+            optics: Function that decides where a ray passes, stops or is absorbed.
             num_together: Number of consecutive rays that share origin and time.
             spread: Greatest angle (rad) between the first of them and another.
         """

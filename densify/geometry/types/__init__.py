@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Define the types that stages hand to each other.
 
-All are frozen. Per-point arrays of an object are aligned row by row. Poses are named
+All types are frozen. Per-point arrays of an object are aligned row by row. Poses are named
 ``T_target_source``: ``p_target = T_target_source @ p_source``. Frames of reference: ``world`` (the
 first sweep's lidar), ``lidar`` (at the sweep's reference time), ``key`` (the key sweep's lidar at
 its reference time), ``cam`` (x right, y down, z forward). As arguments, ``key`` is the frame number

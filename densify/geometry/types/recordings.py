@@ -61,15 +61,15 @@ class Sweep:
         return len(self.points)
 
     def select(self, keep: Bool | slice) -> Sweep:
-        """Return the sweep with only the returns of an (N,) mask or of a slice."""
+        """Return a new sweep of the returns that ``keep`` selects: an (N,) mask or a slice."""
         return select_rows(self, keep, ("points", "intensity", "offset_ns", "lidar", "row"))
 
     def axes(self, lidar: int) -> Float:
-        """Return the (3,3) rotation from the lidar axes to the axes of a scanner (by index)."""
+        """Return the (3,3) rotation from lidar axes to the axes of the scanner with this index."""
         return np.eye(3) if self.R_scanner_lidar is None else self.R_scanner_lidar[lidar]
 
     def origin_m(self, lidar: int) -> Float:
-        """Return the (3,) position, lidar frame, of a scanner (by index)."""
+        """Return the (3,) position in metres, lidar frame, of the scanner with index ``lidar``."""
         return np.zeros(3) if self.scanner_origins is None else self.scanner_origins[lidar]
 
 
@@ -85,7 +85,10 @@ class Trajectory:
     R_level_lidar: Float = field(default_factory=lambda: np.eye(3))
 
     def part(self, frames: Sequence[int], origin: int) -> Trajectory:
-        """Return the poses of some frames in the levelled lidar frame of the sweep ``origin``."""
+        """Return the poses of some frames in the levelled lidar frame of the sweep ``origin``.
+
+        The order of ``frames`` is kept. A frame that the trajectory lacks raises ValueError.
+        """
         rows = [self.frames.index(frame) for frame in frames]
         T_new_lidar = np.eye(4)
         T_new_lidar[:3, :3] = self.R_level_lidar
@@ -117,7 +120,10 @@ class RegisteredSweep:
 
     @staticmethod
     def without_points(trajectory: Trajectory, frame: int) -> RegisteredSweep:
-        """Return the pose and time of a frame of the trajectory as a sweep without points."""
+        """Return the pose and time of a frame of the trajectory as a sweep without points.
+
+        Its twists are 0. A frame that the trajectory lacks raises ValueError.
+        """
         index = trajectory.frames.index(frame)
         sweep = Sweep(
             frame=frame,
@@ -133,7 +139,7 @@ class RegisteredSweep:
 
 @dataclass(frozen=True)
 class Stretch:
-    """A stretch: consecutive registered sweeps in one common world, ascending by frame number."""
+    """Consecutive registered sweeps in one common world, ascending by frame number."""
 
     sweeps: tuple[RegisteredSweep, ...]
 
@@ -146,7 +152,10 @@ class Stretch:
         return self.sweeps[self.frames.index(frame)]
 
     def T_target_source(self, target: int, source: int) -> Float:
-        """Return the (4,4) pose of sweep ``source`` in the lidar frame of sweep ``target``."""
+        """Return the (4,4) pose of the lidar of sweep ``source`` in the lidar frame of ``target``.
+
+        Both are frame numbers of the stretch. A sweep's pose in its own frame is exactly identity.
+        """
         if target == source:
             return np.eye(4)
         return inverse(self[target].T_world_lidar) @ self[source].T_world_lidar
@@ -179,14 +188,17 @@ class FlowField:
 
     @property
     def total(self) -> Float:
-        """(N,3) metres from the measured position to the position at the target time."""
+        """(N,3) metres from the measured position to the position at the target time.
+
+        It is the ``displacement`` alone if ``to_reference`` is None.
+        """
         if self.to_reference is None:
             return self.displacement
         return self.to_reference + self.displacement
 
     @staticmethod
     def zero(num_points: int) -> FlowField:
-        """Return the flow of ``num_points`` points that are all static."""
+        """Return the flow of N points that are all static: no displacement, no object, not lost."""
         displacement = np.zeros((num_points, 3))
         instance = np.full(num_points, -1, np.int32)
         moving, lost = np.zeros((2, num_points), bool)
@@ -197,7 +209,7 @@ class Motion(Protocol):
     """The motion of all points of a stretch, found by any engine (scene-flow method)."""
 
     def flow(self, frame: int, target: int) -> FlowField:
-        """Return the flow of the points of sweep ``frame`` to sweep ``target``'s reference time."""
+        """Return the flow of the points of sweep ``frame`` to the reference time of ``target``."""
         ...
 
 
@@ -211,7 +223,11 @@ class StretchFlow:
 
     @staticmethod
     def towards(key: int, stretch: Stretch, motion: Motion) -> StretchFlow:
-        """Return each sweep's flow to the next sweep towards the key, the key's to a neighbour."""
+        """Return the flow of each sweep of a stretch to the next sweep towards the key sweep.
+
+        The key sweep has its flow to the next sweep, or to the previous one if it is the last. A
+        stretch of a single sweep has no steps. ``key`` is the frame number of the key sweep.
+        """
         up_to_key = [frame for frame in stretch.frames if frame <= key]
         down_to_key = [frame for frame in reversed(stretch.frames) if frame >= key]
         hops = [*pairwise(up_to_key), *pairwise(down_to_key)]
@@ -231,14 +247,14 @@ class Camera:
         height_px: Height of the image.
         K: (3,3) intrinsics in pixels; an integer coordinate is the centre of a pixel.
         T_cam_lidar: (4,4) pose of the lidar frame in the camera frame.
-        distortion: Coefficients of the lens: pinhole k1 k2 p1 p2 k3 ... as OpenCV, empty if
-            rectified; fisheye k1 k2 k3 k4; mei xi k1 k2 p1 p2.
+        distortion: Coefficients of the lens. A pinhole has k1 k2 p1 p2 k3 ... as in OpenCV, none
+            if its images are rectified. A fisheye has k1 k2 k3 k4, a mei lens xi k1 k2 p1 p2.
         model: ``pinhole``, ``fisheye`` (Kannala-Brandt) or ``mei``.
-        max_angle_deg: Greatest angle off the optical axis that the lens sees.
-        row_time_s: Rolling shutter: time from the exposure of a row to the exposure of the row
+        max_angle_deg: Greatest angle off the optical axis that the lens sees, in degrees.
+        row_time_s: Rolling shutter: seconds from the exposure of a row to the exposure of the row
             below. It is negative if the image is read from the bottom, and 0 for a global shutter.
             The stamp of an image is the exposure of its middle.
-        column_time_s: Time from the exposure of a column to the exposure of the next one right.
+        column_time_s: Seconds from the exposure of a column to that of the next one on the right.
     """
 
     name: str
@@ -265,7 +281,7 @@ class Camera:
 
     @property
     def is_rectified(self) -> bool:
-        """True for a pinhole without distortion."""
+        """True for a pinhole without distortion coefficients."""
         return self.model == "pinhole" and not self.distortion
 
     @property
@@ -275,7 +291,7 @@ class Camera:
 
     @property
     def focal_px(self) -> float:
-        """Pixels to the right per radian, at the principal point."""
+        """Focal length: pixels along u for each radian off the axis, at the principal point."""
         xi = self.distortion[0] if self.model == "mei" else 0.0
         return float(self.K[0, 0] / (1 + xi))
 
@@ -315,24 +331,27 @@ class LidarSequence(Protocol):
     def __getitem__(self, frame: int) -> Sweep: ...
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep, without reading its points."""
+        """Return the reference time of a sweep in nanoseconds, without reading its points."""
         ...
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return image number -> exposure time of the middle row, both ascending, of a camera."""
+        """Return image number -> exposure time (ns) of a camera's middle row, both ascending."""
         ...
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Return the (H,W,3) RGB image of this number."""
+        """Return the (H,W,3) RGB image with this number of the named camera."""
         ...
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the data set's own (4,4) lidar pose at the sweep's reference time."""
+        """Return the data set's own (4,4) lidar pose at the sweep's reference time.
+
+        The world is the data set's. InputError is raised if the data set has no poses.
+        """
         ...
 
 
 def in_one_line(sequence: LidarSequence) -> str:
-    """Return what a recording holds, for its ``repr``."""
+    """Return a line with the name, sweeps and cameras of a recording, for its ``repr``."""
     frames = sequence.frames
     cameras = ", ".join(sequence.cameras) or "none"
     span = f" from {frames[0]} to {frames[-1]}" if len(frames) else ""
@@ -344,7 +363,7 @@ class BoxView:
     """The camera image in which an annotator drew the boxes."""
 
     camera: Camera
-    # (R,4) left, top, right, bottom of R image rectangles that are not annotated
+    # (R,4) left, top, right, bottom, pixels, of R image rectangles that are not annotated
     left_out_px: Float
 
 
@@ -357,9 +376,9 @@ class Boxes:
     # (K,4,4) pose of each box in the lidar frame at the reference time, for points compensated for
     # ego-motion. The box frame is in the middle of the box, x to the front, z up.
     T_lidar_box: Float
-    size_m: Float  # (K,3) length, width, height
-    # (K,) time since the reference time at which the lidar frame of ``T_lidar_box`` is taken; None
-    # for 0
+    size_m: Float  # (K,3) length, width, height in metres
+    # (K,) ns since the reference time at which the lidar frame of ``T_lidar_box`` is taken. None
+    # means 0 for all boxes.
     offset_ns: Int | None = None
     # (K,) index of the scanner whose points a box encloses, -1 for all scanners; None if every box
     # encloses the points of all scanners
@@ -379,25 +398,30 @@ class SweepTruth:
 
 
 class Truth(Protocol):
-    """Exact ground truth of a simulated sequence."""
+    """Exact ground truth of a simulated sequence.
+
+    Arrays by point have a row for each row of the stored sweep: `Sweep.row` selects from them.
+    """
 
     def sweep(self, frame: int) -> SweepTruth:
-        """Return the ground truth of a sweep."""
+        """Return the ground truth of the sweep with this frame number."""
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the (N,3) true scene flow (m) of a sweep's points to the time of sweep ``target``.
+        """Return the (N,3) true scene flow in metres of a sweep's points to another sweep's time.
 
-        It is in the lidar frame of ``frame``, with ego-motion removed, and 0 for static points.
+        Sweep ``target`` gives the target time. The flow is in the lidar frame of sweep ``frame``,
+        ego-motion removed, and 0 for static points.
         """
         ...
 
     def depth_m(self, camera: str, number: int) -> Float32:
-        """Return the (H,W) true depth of an image in metres, 0 where the ray meets no surface.
+        """Return the (H,W) true depth in metres of the image with this number of the named camera.
 
-        It is at the exposure of each row, in the camera's own measure (`Camera.measure`).
+        It is at the exposure of each row, in the camera's own measure (`Camera.measure`). It is 0
+        where the ray meets no surface.
         """
         ...
 
     def moving_mask(self, camera: str, number: int) -> Bool:
-        """Return (H,W) True for pixels of moving objects."""
+        """Return an (H,W) mask of the image ``number`` of a camera, True at moving objects."""
         ...

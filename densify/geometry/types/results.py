@@ -31,10 +31,10 @@ class Cloud:
         moving: (M,) True if the point belongs to a moving object.
         instance: (M,) number of the moving object, -1 for none.
         velocity_m_s: (M,3) at the key's time, key frame, ego-motion removed; 0 if static.
-        confidence: (M,) of 0 to 1, of pixels that confirm the point; 0 where no map does. For
-            methods without visibility 1 / (1 + seconds from the key sweep).
+        confidence: (M,) from 0 to 1: the confidence of pixels that confirm the point, 0 if none
+            does. Methods without visibility take 1 / (1 + seconds from the key sweep).
         intensity: (M,) from 0 to 1.
-        rgb: (M,3), black for points that no camera observed.
+        rgb: (M,3) colour from 0 to 255, black for points that no camera observed.
         far: (M,) True if the source sweep is beyond the window (``accumulate.far_m``).
     """
 
@@ -59,17 +59,18 @@ class Cloud:
         return np.sqrt(x * x + y * y + z * z).astype(np.float32)
 
     def joined(self, cloud: Cloud) -> Cloud:
-        """Return a cloud of this cloud's points, then the points of ``cloud``."""
+        """Return a new cloud of this cloud's points, followed by the points of ``cloud``."""
         return joined_rows([self, cloud])
 
     def select(self, keep: Bool | Int) -> Cloud:
-        """Return a cloud with only the points of an (M,) mask, or of an array of point indices."""
+        """Return a cloud of the points that ``keep`` selects: an (M,) mask, or point indices."""
         return select_rows(self, keep)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the attributes as (M,) columns by name, vectors split into one column per axis.
+        """Return the attributes as (M,) columns by name, with a column for each axis of a vector.
 
-        These are x y z, rigid_x ..., velocity_x ... (m/s), and red green blue.
+        These columns are x y z, rigid_x ..., velocity_x ... (m/s), and red green blue. All other
+        attributes keep their names.
         """
         by_axis = {
             "points": "x y z",
@@ -95,15 +96,15 @@ class Patches(NamedTuple):
     """The surface patches of the M points of a cloud, as large as the spacing of rays there."""
 
     normal: Float32  # (M,3) normal of the tangent plane, of any length, key frame
-    # (M,2) distance to the neighbouring rays of the same sweep: in azimuth, then in elevation
+    # (M,2) metres to the neighbouring rays of the same sweep: in azimuth, then in elevation
     spacing_m: Float32
 
     def joined(self, patches: Patches) -> Patches:
-        """Return these patches, then ``patches``, of another cloud."""
+        """Return new patches: these, followed by ``patches`` of another cloud."""
         return joined_rows([self, patches])
 
     def select(self, keep: Bool) -> Patches:
-        """Return the patches of ``cloud.select(keep)``, for an (M,) mask ``keep``."""
+        """Return the patches of the points that ``keep``, an (M,) mask, selects."""
         return select_rows(self, keep)
 
 
@@ -113,17 +114,17 @@ class StaticWorld:
 
     points: Float32  # (K,3) metres, in the world of the registered window
     normal: Float32  # (K,3) normal of the tangent plane, of any length, same frame
-    spacing_m: Float32  # (K,2) distance to the neighbouring rays of the same sweep, as in `Patches`
+    spacing_m: Float32  # (K,2) metres to the neighbouring rays: in azimuth, then in elevation
     source: NDArray[np.int32]  # (K,) index of the source sweep in ``frames``
     row: Int  # (K,) row of the point in the file of the source sweep
     lidar: NDArray[np.uint8]  # (K,) index of the scanner
     intensity: Float32  # (K,) of 0 to 1
     frames: tuple[int, ...]  # frame numbers of the n sweeps
-    stamp_ns: Int  # (n,) reference times
+    stamp_ns: Int  # (n,) reference times of the n sweeps
     left_out: tuple[int, ...] = ()  # frame numbers of sweeps without a reliable registration
 
     def select(self, keep: Bool | Int) -> StaticWorld:
-        """Return a world with only the points of a (K,) mask, or of an array of point indices."""
+        """Return a world of the points that ``keep`` selects: a (K,) mask, or point indices."""
         return select_rows(self, keep, _WORLD_COLUMNS)
 
     def __len__(self) -> int:
@@ -158,7 +159,7 @@ class Rejected(NamedTuple):
     """Pixels without a depth in the map, because a rule rejected their depth."""
 
     depth_m: Float32  # (H,W) rejected depth in metres, 0 elsewhere
-    confidence: Float32  # (H,W) of the rejected depth
+    confidence: Float32  # (H,W) confidence of the rejected depth, from 0 to 1
     frame: NDArray[np.int32]  # (H,W) frame number of the sweep that measured it, -1 elsewhere
 
 
@@ -197,10 +198,16 @@ class DepthMap:
     rejected: Rejected | None = None
 
     def to_points(self, view: CameraView, filled: bool = True) -> Float:
-        """Return the map's pixels as points (K,3) in the key frame, metres, row by row.
+        """Return the map's pixels with a depth as points (K,3), metres, key frame, row by row.
 
-        Moving objects are at their position at the image's exposure. ``view`` is of
-        ``Result.views``. The camera must be rectified and the map hold z.
+        Moving objects are at their position at the image's exposure.
+
+        Args:
+            view: Viewpoint of this map, from ``Result.views``.
+            filled: Take the depths of ``filled_m``. False takes those of ``depth_m``.
+
+        Raises:
+            InputError: If the camera is not a rectified pinhole, or the map's measure is not ``z``.
         """
         camera = view.camera
         if not camera.is_rectified or self.measure != "z":
@@ -217,14 +224,14 @@ class DepthMap:
         return np.asarray(points_cam @ T_key_cam[:3, :3].T + T_key_cam[:3, 3])
 
     def counts(self) -> dict[str, int]:
-        """Return the number of points per `Reason`, by its name in lower case."""
+        """Return the number of points for each `Reason`, by the reason's name in lower case."""
         counts = np.bincount(self.reason, minlength=max(Reason) + 1)
         return {reason.name.lower(): int(counts[reason]) for reason in Reason}
 
 
 @dataclass(frozen=True)
 class Mover:
-    """One moving object alone: its points, and map name -> depth map of these points."""
+    """One moving object alone: its points, and a depth map of these points for each map name."""
 
     cloud: Cloud
     depth: Mapping[str, DepthMap]
@@ -251,8 +258,8 @@ class ObjectTrack:
     T_key_object: Float  # (n,4,4) poses in the key frame, ego-motion removed
     velocity_m_s: Float  # (n,3) velocity of the middle of the box, key frame, ego-motion removed
     num_points: Int  # (n,) number of points of the object in each sweep
-    seen_size_m: Float  # (3,) size of the box around its points
-    # Sides of the box that were seen: of front, rear, left, right and top
+    seen_size_m: Float  # (3,) length, width and height of the box around its observed points
+    # Sides of the box that were observed, from "front", "rear", "left", "right" and "top"
     sides_seen: tuple[str, ...] = ()
 
 
@@ -288,7 +295,7 @@ class FullDepth:
 
     # (H,W) metres, 0 for none. Pixels with a depth in ``DepthMap.filled_m`` keep it.
     depth_m: Float32
-    confidence: Float32  # (H,W) of 0 to 1; pixels of the prior are below all others
+    confidence: Float32  # (H,W) from 0 to 1. Pixels of the prior are below all others.
     from_prior: Bool  # (H,W) True for pixels whose depth is from the prior
     fit: PriorFit  # fit of the prior to the map
     source: str  # file of the prior
@@ -300,7 +307,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class StageCost:
-    """The wall time of a pipeline stage and the peak memory of the process at its end."""
+    """The wall time of a pipeline stage, and the peak memory of the process at the stage's end."""
 
     name: str
     seconds: float
