@@ -22,12 +22,12 @@ _FEW_POINTS_PER_S = 800_000  # 64 rings have 1.2 million, 32 have 700,000
 _AROUND_FEW_S, _AROUND_S = 0.5, 0.3
 
 
-def within(default: float | None, low: float, high: float) -> Any:
+def number_field(default: float | None, low: float, high: float) -> Any:
     """Return a dataclass field for a number with inclusive bounds."""
     return field(default=default, metadata={"limits": (low, high)})
 
 
-def one_of(*words: str) -> Any:
+def choice_field(*words: str) -> Any:
     """Return a dataclass field for a choice among words; the default is the first word."""
     return field(default=words[0], metadata={"words": words})
 
@@ -38,11 +38,11 @@ class Section:
 
     def __post_init__(self) -> None:
         for knob in fields(self):
-            value = checked(type(self), knob.name, getattr(self, knob.name), "")
+            value = convert_value(type(self), knob.name, getattr(self, knob.name), "")
             object.__setattr__(self, knob.name, value)
 
 
-def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
+def convert_value(section: type[Section], key: str, value: Any, where: str) -> Any:
     """Return a user's value converted to the type of its setting.
 
     Args:
@@ -77,10 +77,10 @@ def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
 class RegisterSettings(Section):
     """Settings for the pose of the lidar at every sweep."""
 
-    source: str = one_of("kiss-icp", "dataset")
-    voxel_size_m: float = within(0.5, 0.05, 10)
-    min_range_m: float = within(2.8, 0, 50)
-    max_range_m: float = within(120.0, 5, 500)
+    source: str = choice_field("kiss-icp", "dataset")
+    voxel_size_m: float = number_field(0.5, 0.05, 10)
+    min_range_m: float = number_field(2.8, 0, 50)
+    max_range_m: float = number_field(120.0, 5, 500)
     deskew: bool = True
 
     def __post_init__(self) -> None:
@@ -97,7 +97,7 @@ class FlowSettings(Section):
     """Settings for scene flow."""
 
     engine: str = "groups"
-    look_around_s: float | None = within(None, 0, 5)
+    look_around_s: float | None = number_field(None, 0, 5)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -115,9 +115,9 @@ class FlowSettings(Section):
 class ObjectiveSettings(Section):
     """Settings of engine paper; all but static_prior also apply to the flow of two point files."""
 
-    solver: str = one_of("pcg", "adam")
-    alpha: float = within(10.0, 0, 1e6)
-    num_neighbors: int = within(50, 1, 500)
+    solver: str = choice_field("pcg", "adam")
+    alpha: float = number_field(10.0, 0, 1e6)
+    num_neighbors: int = number_field(50, 1, 500)
     static_prior: bool = True
 
 
@@ -125,21 +125,21 @@ class ObjectiveSettings(Section):
 class AccumulateSettings(Section):
     """Settings for the accumulated cloud at the key's time."""
 
-    unfollowed: str = one_of("drop", "rigid")
-    far_m: float = within(40.0, 0, 500)
+    unfollowed: str = choice_field("drop", "rigid")
+    far_m: float = number_field(40.0, 0, 500)
 
 
 @dataclass(frozen=True)
 class ProjectSettings(Section):
     """Settings for depth maps of the accumulated cloud."""
 
-    at: str = one_of("camera", "sweep")
-    per: str = one_of("sweep", "image")
-    depth: str = one_of("auto", "z", "range")
+    at: str = choice_field("camera", "sweep")
+    per: str = choice_field("sweep", "image")
+    depth: str = choice_field("auto", "z", "range")
     visibility: bool = True
-    rims: str = one_of("image", "strict", "keep")
-    fill_reach: float = within(1.5, 0.1, 5)
-    max_outliers: float | None = within(None, 0.0001, 1)
+    rims: str = choice_field("image", "strict", "keep")
+    fill_reach: float = number_field(1.5, 0.1, 5)
+    max_outliers: float | None = number_field(None, 0.0001, 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -154,19 +154,19 @@ class ProjectSettings(Section):
 class PriorSettings(Section):
     """Settings for depth images from the user (--prior), which complete unmeasured pixels."""
 
-    kind: str = one_of("auto", "depth", "inverse")
+    kind: str = choice_field("auto", "depth", "inverse")
 
 
 @dataclass(frozen=True)
 class OutputSettings(Section):
     """Settings for files in addition to the files that every run writes."""
 
-    flow: str = one_of("none", "npz")
+    flow: str = choice_field("none", "npz")
     optical_flow: bool = False
     rejected: bool = False
     score: bool = False
     report: bool = False
-    movers: str = one_of("keep", "drop", "separate")
+    movers: str = choice_field("keep", "drop", "separate")
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
     return asdict(config)
 
 
-def changed(config: Config) -> dict[str, dict[str, Any]]:
+def find_changes(config: Config) -> dict[str, dict[str, Any]]:
     """Return ``{section: {key: value}}`` with the settings that differ from their defaults."""
     defaults = as_mapping(Config())
     changes = {
@@ -285,7 +285,7 @@ def _apply_changes(
                 owners = [section for section, known in values.items() if key in known]
                 hint = f"did you mean {owners[0]}.{key}?" if owners else hint
                 raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
-            values[name][key] = checked(sections[name], key, value, f"{where}: ")
+            values[name][key] = convert_value(sections[name], key, value, f"{where}: ")
 
 
 def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:

@@ -130,7 +130,9 @@ def code_digest() -> str:
     return state.hexdigest()
 
 
-def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
+def get_cached(
+    cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]
+) -> T:
     """Return `Cache.get`, or without a cache the result of ``make`` without calling ``inputs``."""
     return make() if cache is None else cache.get(step, inputs(), make)
 

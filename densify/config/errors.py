@@ -12,7 +12,7 @@ _BREAK = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 _MOST_CHARACTERS = 1000
 
 
-def brief(message: str) -> str:
+def shorten_message(message: str) -> str:
     """Return the message on one line, with long quoted values and long words shortened."""
     message = _LONG_VALUE.sub(lambda match: _cut(match[0], 200), _BREAK.sub(" ", message))
     return _cut(message, _MOST_CHARACTERS) if len(message) > _MOST_CHARACTERS else message
@@ -37,7 +37,7 @@ def did_you_mean(got: str, known: Iterable[str]) -> str:
 
 class _ShortError(Exception):
     def __init__(self, message: str, *args: object) -> None:
-        super().__init__(brief(message), *args)
+        super().__init__(shorten_message(message), *args)
 
 
 class InputError(_ShortError):

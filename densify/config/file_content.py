@@ -52,7 +52,7 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
             raise InputError(f"{path}: cannot be read: {reason(error)}") from error
 
 
-def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
+def decompress_gzip(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
     """Return decompressed gzip data."""
     try:
         with gzip.open(io.BytesIO(data)) as file:
@@ -148,7 +148,7 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
         _note_lines(value, full, lines)
 
 
-def needed(module: str, extra: str, needed_by: str) -> Any:
+def import_optional(module: str, extra: str, needed_by: str) -> Any:
     """Import and return an optional module, which the ``extra`` of this package installs."""
     package = module.partition(".")[0]
     try:

@@ -43,7 +43,7 @@ class Plugin:
         """Name and argument as users write them."""
         return f"{self.name}:{self.argument}" if self.argument else self.name
 
-    def work(self) -> Any:
+    def load_module(self) -> Any:
         """Import and return the plug-in's module."""
         return import_module(self.module)
 
@@ -71,7 +71,7 @@ class Table:
                 f"{', '.join(usages)} (packages add others by entry points in {self.group})"
             )
 
-    def row(self, name: str, where: str) -> Plugin:
+    def plugin(self, name: str, where: str) -> Plugin:
         """Return the plug-in of this name; another package's module is imported."""
         self.require(name, where)
         return self._loaded(self._rows()[name])
@@ -146,7 +146,7 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 def engine(spec: str) -> tuple[Plugin, str]:
     """Return the plug-in and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``."""
     name, argument = check_engine_spec(spec)
-    return ENGINES.row(name, "flow.engine"), argument
+    return ENGINES.plugin(name, "flow.engine"), argument
 
 
 def _any(*patterns: str) -> Callable[[Path], bool]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config.errors import InputError, brief
+from densify.config.errors import InputError, shorten_message
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry import poses
 from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
@@ -311,7 +311,7 @@ def read_scene(path: Path) -> SceneFile:
         return SceneFile(
             table,
             {name: _view(view) for name, view in table["views"].items()},
-            {f: checks.rigid(T, "T_key_lidar") for f, T in T_key_lidar.items() if T is not None},
+            {f: checks.pose(T, "T_key_lidar") for f, T in T_key_lidar.items() if T is not None},
         )
 
 
@@ -333,7 +333,7 @@ def _damage_named(path: Path) -> Iterator[None]:
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
         if str(error).startswith(str(path)):
             raise
-        reason = brief(f"{type(error).__name__}: {error}")
+        reason = shorten_message(f"{type(error).__name__}: {error}")
         raise InputError(
             f"{path}: damaged, or of another version ({reason}); densify the key again"
         ) from error
@@ -343,21 +343,21 @@ def _view(entry: Mapping[str, Any]) -> CameraView:
     """Return the camera and pose of an entry in scene.json."""
     values = {field.name: entry[field.name] for field in fields(Camera)} | {
         "K": _array(entry["K"], 3, 3),
-        "T_cam_lidar": checks.rigid(entry["T_cam_lidar"], "T_cam_lidar"),
+        "T_cam_lidar": checks.pose(entry["T_cam_lidar"], "T_cam_lidar"),
         "distortion": tuple(map(float, entry["distortion"])),
     }
     camera = Camera(**values)
     is_known = camera.model in ("pinhole", "fisheye", "mei")
     if not is_known or not min(camera.width_px, camera.height_px, camera.K[0, 0]) > 0:
         raise ValueError(f"camera {camera.name}: size, model or K")
-    T_cam_key = checks.rigid(entry["T_cam_key"], "T_cam_key")
+    T_cam_key = checks.pose(entry["T_cam_key"], "T_cam_key")
     return CameraView(camera, T_cam_key, float(entry["late_s"]), entry["number"])
 
 
 def _track(entry: Mapping[str, Any]) -> ObjectTrack:
     """Return the track of an entry in movers.json."""
     columns = {name: [pose[name] for pose in entry["poses"]] for name in entry["poses"][0]}
-    T_key_object = [checks.rigid(T, "T_key_object") for T in columns["T_key_object"]]
+    T_key_object = [checks.pose(T, "T_key_object") for T in columns["T_key_object"]]
     return ObjectTrack(
         instance=int(entry["instance"]),
         size_m=_array(entry["size_m"], 3),

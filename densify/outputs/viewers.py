@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError, OutputError
-from densify.config.file_content import needed
+from densify.config.file_content import import_optional
 from densify.geometry import poses
 from densify.geometry.arrays import table
 from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
 from densify.outputs.cloud_files import StoredCloud
 from densify.outputs.depth_png import Picture, metres
 from densify.outputs.finished_run import FinishedRun, key_poses
-from densify.outputs.plots import coloured
+from densify.outputs.plots import colour_depth
 from densify.readers.decoded_files import decode_image
 
 _NS = 10**9
@@ -114,7 +114,7 @@ def _shot(run: FinishedRun, name: str) -> Shot:
 
 def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``recording.mcap``. Equal runs give equal bytes."""
-    foxglove = needed("foxglove", "mcap", "MCAP files")
+    foxglove = import_optional("foxglove", "mcap", "MCAP files")
     context, channels = foxglove.Context(), {}
     options = foxglove.mcap.MCAPWriteOptions(compression_threads=0)
     messages = _FoxgloveMessages(foxglove.messages)
@@ -265,7 +265,7 @@ def show_in_rerun(runs: Sequence[FinishedRun]) -> None:
 
 def _rerun_stream(runs: Sequence[FinishedRun]) -> Any:
     """Return a new recording of rerun."""
-    rr = needed("rerun", "rerun", "Recordings for rerun")
+    rr = import_optional("rerun", "rerun", "Recordings for rerun")
     name = f"key-{runs[0].key}-{runs[-1].key}"
     stream = rr.RecordingStream("densify", recording_id=name, send_properties=False)
     stream.set_log_time_enabled(False)
@@ -344,7 +344,7 @@ def _rerun_pose(T: Float) -> Any:
 
 def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
     """Show points and boxes, with a time line of several runs, until the window is closed."""
-    o3d, shown = needed("open3d", "open3d", "Windows with the cloud"), []
+    o3d, shown = import_optional("open3d", "open3d", "Windows with the cloud"), []
     for time, timeline in enumerate(timelines(runs)):
         cloud = timeline.cloud
         for group, keep in (("static", ~cloud.moving), ("moving", cloud.moving)):
@@ -391,7 +391,7 @@ def write_mp4(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 def _picture(run: FinishedRun, name: str) -> Picture:
     """Return an image above its filled depth, as (h,w,3) blue, green, red, and a black bar."""
-    depth = coloured(metres(run.maps(name)["depth_filled"]))
+    depth = colour_depth(metres(run.maps(name)["depth_filled"]))
     panels, jpeg = [depth], run.jpeg(name)
     if jpeg is not None:
         panels.insert(0, decode_image(jpeg, run.folder))

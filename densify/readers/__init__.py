@@ -88,7 +88,7 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
         raise InputError(
             f"data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
         )
-    module = cast(ReaderModule, reader.work())
+    module = cast(ReaderModule, reader.load_module())
     sequence = module.open_recording(parsed.path, parsed.scene)
     if isinstance(sequence, FileSequence):
         sequence.check_first_images()
@@ -98,7 +98,7 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
 def _reader_of(parsed: Spec, where: str) -> Plugin:
     """Return the named reader, or the first reader that recognises the path."""
     if parsed.reader is not None:
-        return READERS.row(parsed.reader, where)
+        return READERS.plugin(parsed.reader, where)
     if not parsed.path.exists():
         name, _, _ = parsed.place.partition(":")
         hint = did_you_mean(name, [*READERS.names(), "street"])
@@ -145,10 +145,10 @@ def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
 
 def describe(sequence: LidarSequence) -> str:
     """Return a summary of a recording as aligned lines of text: the pairs of `findings`."""
-    return in_lines(findings(sequence))
+    return align(findings(sequence))
 
 
-def in_lines(lines: Sequence[tuple[str, str]]) -> str:
+def align(lines: Sequence[tuple[str, str]]) -> str:
     """Return (name, text) pairs as lines in which all texts start in the same column."""
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(f"{label:<{width}}{text}" for label, text in lines)

@@ -94,7 +94,7 @@ class Argoverse2(FileSequence):
         offset_ns = columns["offset_ns"].astype(np.int64)
         points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
         return Returns(
-            self._track.as_fired(points, self._stamps_ns[frame], offset_ns),
+            self._track.undo_compensation(points, self._stamps_ns[frame], offset_ns),
             (columns["intensity"] / 255.0).astype(np.float32),
             offset_ns,
             columns["laser_number"].astype(np.int64) // LASERS_PER_SCANNER,

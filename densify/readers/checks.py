@@ -65,7 +65,7 @@ def drive_around(path: Path) -> Path | None:
     return next((parent for parent in parents if (parent / "velodyne_points").is_dir()), None)
 
 
-def of_frame(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
+def find_entry(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
     """Return the entry of a frame; the error for a missing one names ``where`` and ``kind``."""
     if frame not in entries:
         raise InputError(
@@ -83,7 +83,7 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
     return cameras[name]
 
 
-def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
+def decode_camera_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
     """Decode an image file's bytes to (H,W,3) uint8 RGB; a gray image has three equal channels."""
     bgr = decode_image(data, where)
     check_image_size(bgr.shape, camera, where)
@@ -159,7 +159,7 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
     return values
 
 
-def rigid(T: Any, where: str) -> Float:
+def pose(T: Any, where: str) -> Float:
     """Return a (4,4) rigid transform, checked, from (4,4), (3,4), or 16 or 12 numbers."""
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T

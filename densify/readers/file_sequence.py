@@ -104,7 +104,7 @@ class FileSequence(ABC):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """Return an existing image, (H,W,3) uint8 RGB."""
         path = self._image_files[camera.name][number]
-        return checks.decoded_image(read_bytes(path), camera, path)
+        return checks.decode_camera_image(read_bytes(path), camera, path)
 
     def _pose(self, frame: int) -> Float:
         """Return the (4,4) T_world_lidar of an existing sweep; InputError without poses."""
@@ -168,17 +168,17 @@ class FileSequence(ABC):
     def T_world_lidar(self, frame: int) -> Float:
         """Return the recorded (4,4) pose of the lidar in the world at a sweep's reference time."""
         self.check_frame(frame)
-        return checks.rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
+        return checks.pose(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
     def check_frame(self, frame: int) -> None:
         """Raise InputError, with the existing frame numbers, if the sweep does not exist."""
         if frame not in self._frames:
-            checks.of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
+            checks.find_entry(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
         """Return the camera of an image; raise InputError if the image does not exist."""
         calibrated = checks.camera_named(self.cameras, camera, self.where)
-        checks.of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
+        checks.find_entry(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated
 
 

@@ -174,7 +174,7 @@ class LabelledFlow:
     valid: Bool  # (N,) bool, the ground-truth flow of the point is known
 
 
-def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
+def read_labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
     """Read the ground-truth flow of a sweep to the next sweep of the stretch."""
     if not folder.is_dir():
         raise InputError(f"--truth {folder}: no such folder; expected true flow in it")

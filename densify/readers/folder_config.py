@@ -97,7 +97,7 @@ _NUMBER = Kind(lambda value: float(_array(value)), "a finite number")
 _ABOVE_0 = Kind(_above_0, "a finite number above 0")
 _UNIT = _one_of(UNIT_NS)
 _MOTION = Kind(
-    lambda value: checks.rigid(_array(value, -1, 4), ""),
+    lambda value: checks.pose(_array(value, -1, 4), ""),
     "three or four rows of a rotation and translation",
 )
 _POINTS = Kind(lambda value: _array(value, -1, 3), "finite numbers of shape (N, 3)")

@@ -211,7 +211,7 @@ class KittiRaw(Drive):
         # The frame's own record is up to 20 ms away from the sweep, which is 0.3 m at 15 m/s.
         if not self._oxts:
             return super()._pose(frame)
-        checks.of_frame(self._oxts, frame, "oxts record", self.where)
+        checks.find_entry(self._oxts, frame, "oxts record", self.where)
         T_imu_lidar = poses.inverse(self._T_lidar_imu)
         recorded_ns = self._oxts_stamps.by_frame
         frames = [f for f in (frame - 1, frame, frame + 1) if f in recorded_ns and f in self._oxts]
@@ -300,7 +300,7 @@ class KittiOdometry(Drive):
         points = stored
         for _ in range(_NUM_ROUNDS):
             offset_ns = turned_ns(points, self._stamps.period_ns)
-            points = self._track.as_fired(stored, self.stamp_ns(frame), offset_ns)
+            points = self._track.undo_compensation(stored, self.stamp_ns(frame), offset_ns)
         return Returns(points, intensity, offset_ns)
 
     def _pose(self, frame: int) -> Float:
@@ -355,7 +355,7 @@ class KittiTracking(Drive):
             return super()._pose(frame)
         lines = dict(enumerate(read_text(path).splitlines()))
         first, record = (
-            parse_oxts(checks.of_frame(lines, f, "oxts record", path), f"{path}: line {f + 1}")
+            parse_oxts(checks.find_entry(lines, f, "oxts record", path), f"{path}: line {f + 1}")
             for f in (0, frame)
         )
         return T_first_imu(first, record) @ poses.inverse(self._calibration.motion("Tr_imu_velo"))
@@ -429,7 +429,7 @@ class Kitti360(Drive):
             where = f"{self._pose_file}: line {number}"
             frame, *numbers = checks.parse_numbers(line, where, 13).tolist()
             if frame in self._stamps.by_frame:
-                T_world_pose[self._stamps.by_frame[int(frame)]] = checks.rigid(numbers, where)
+                T_world_pose[self._stamps.by_frame[int(frame)]] = checks.pose(numbers, where)
         stamps_ns = np.array(list(T_world_pose), np.int64)
         T = np.reshape(list(T_world_pose.values()), (-1, 4, 4))
         return PoseTrack(str(self._pose_file), stamps_ns, T)
@@ -443,7 +443,7 @@ class Kitti360(Drive):
         """The (4,4) pose of the scanner in the vehicle's frame, computed through camera 0."""
         path = self.where / "calibration" / "calib_cam_to_velo.txt"
         where = f"{path}: the transform from camera 0 to the scanner"
-        T_lidar_cam = checks.rigid(checks.parse_numbers(read_text(path), where, 12), where)
+        T_lidar_cam = checks.pose(checks.parse_numbers(read_text(path), where, 12), where)
         return self._to_pose.motion("image_00") @ poses.inverse(T_lidar_cam)
 
     def _camera(self, name: str) -> Camera:

@@ -58,7 +58,7 @@ class Stamps:
         """Return the time (ns) of a frame; raise InputError if the file has no time of it."""
         if not self.by_frame:
             return frame * NOMINAL_PERIOD_NS
-        return checks.of_frame(self.by_frame, frame, "stamp", self.path)
+        return checks.find_entry(self.by_frame, frame, "stamp", self.path)
 
     def of(self, frames: Mapping[int, Path]) -> dict[int, int]:
         """Return the times (ns) of those of the given frames that have one, by frame."""
@@ -144,12 +144,12 @@ class Calibration:
 
     def motion(self, key: str) -> Float:
         """Return the (4,4) transform of an entry of twelve numbers, its upper three rows."""
-        return checks.rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
+        return checks.pose(self.numbers(key, 3, 4), f"{self.path}: {key}")
 
     def rotation(self, key: str, translation: str = "") -> Float:
         """Return the (4,4) transform of an entry's rotation (3,3) and a named translation (m)."""
         t = self.numbers(translation, 3, 1) if translation else np.zeros((3, 1))
-        return checks.rigid(np.hstack([self.numbers(key, 3, 3), t]), f"{self.path}: {key}")
+        return checks.pose(np.hstack([self.numbers(key, 3, 3), t]), f"{self.path}: {key}")
 
     def rectified_camera(
         self, key: str, name: str, size_px: tuple[int, int] | str, T_rect_lidar: Float

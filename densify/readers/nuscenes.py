@@ -317,7 +317,7 @@ class NuScenes(FileSequence):
         # A new firing begins where the ring number falls.
         column: Int = np.cumsum(np.diff(rows[:, 4], prepend=0.0) < 0, dtype=np.int64)
         offset_ns: Int = (column - column[-1:]) * _COLUMN_NS
-        points = self._track.as_fired(rows[:, :3], self._stamps_ns[frame], offset_ns)
+        points = self._track.undo_compensation(rows[:, :3], self._stamps_ns[frame], offset_ns)
         points[np.linalg.norm(points, axis=1) < _NO_RETURN_M] = 0.0
         return Returns(points, (rows[:, 3] / 255).astype(np.float32), offset_ns)
 

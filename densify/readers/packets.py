@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, open_file, read_json, reason
+from densify.config.file_content import import_optional, open_file, read_json, reason
 from densify.geometry.types import Int
 from densify.readers.file_sequence import FileSequence, Returns
 
@@ -96,7 +96,7 @@ class Velodyne(FileSequence):
     """A Velodyne capture as a `LidarSequence`, stamped at the last packet of each sweep."""
 
     def __init__(self, path: Path, model: str) -> None:
-        self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
+        self._library = import_optional("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
         packets, num_twice = _once(_find_packets(path))
         self._begin, self._captured_ns, azimuth, clock_us = packets
@@ -205,7 +205,8 @@ class Ouster(FileSequence):
     def __init__(self, path: Path, metadata: Path) -> None:
         # The decoder's modules
         core, pcap = (
-            needed(f"ouster.sdk.{name}", "ouster", "Ouster captures") for name in ("core", "pcap")
+            import_optional(f"ouster.sdk.{name}", "ouster", "Ouster captures")
+            for name in ("core", "pcap")
         )
         read_json(metadata)
         open_file(path).close()  # raises a clear error for an unreadable file
@@ -238,7 +239,7 @@ class Ouster(FileSequence):
         packets = [p for _, p in self._packets if isinstance(p, self._is_lidar_packet)]
         turn = np.array([p.frame_id() for p in packets], np.int64)
         column = [int(p.format.packet_header(self._column, p.buf)[0]) for p in packets]
-        num_lost, num_twice = lost_and_doubled(turn, np.array(column, np.int64))
+        num_lost, num_twice = count_lost_and_repeated(turn, np.array(column, np.int64))
         return _packet_counts(len(packets) - num_twice, num_lost, num_twice)
 
     def _returns(self, frame: int) -> Returns:
@@ -267,7 +268,7 @@ class Ouster(FileSequence):
         )
 
 
-def lost_and_doubled(turn: Int, column: Int) -> tuple[int, int]:
+def count_lost_and_repeated(turn: Int, column: Int) -> tuple[int, int]:
     """Return the number of packets missing between others, and of those captured a second time.
 
     ``turn`` (P,) of the packets wraps at 16 bits; ``column`` (P,) is the first column of each.

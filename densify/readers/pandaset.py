@@ -123,7 +123,7 @@ class PandaSet(FileSequence):
         T_lidar_world = poses.inverse(self._track.at(stamp_ns))
         points = poses.transform(T_lidar_world, np.column_stack([x, y, z]))
         return Returns(
-            self._track.as_fired(points, stamp_ns, offset_ns),
+            self._track.undo_compensation(points, stamp_ns, offset_ns),
             (brightness / 255).astype(np.float32),
             offset_ns,
             np.clip(scanner, 0, 1).astype(np.uint8),

@@ -363,7 +363,7 @@ class RosBag(FileSequence):
             track, source = self._track_and_source
             if track is None:
                 raise InputError(f"{self.where}: registered clouds need their odometry: {source}")
-            returns = track.taken_back(returns, entry.stamp_ns)
+            returns = track.undo_placement(returns, entry.stamp_ns)
         points = np.zeros_like(returns.points)
         points[valid] = poses.transform(lidar.T_first_lidar, returns.points[valid])
         offset_ns = returns.offset_ns

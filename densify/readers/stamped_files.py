@@ -230,7 +230,7 @@ class Series:
     stamped_by: str  # source of the stamps, for people; "" without stamps
 
 
-def in_time(
+def order_by_time(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
     """Order files by time and find their stamps; files whose names are times are numbered from 0.
@@ -289,13 +289,13 @@ def _numbered(names: Sequence[NamedFile]) -> dict[int, NamedFile]:
 
 def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | None:
     if name:
-        return existing(folder if (folder / name).is_file() else root, name, "stamps")
+        return require_path(folder if (folder / name).is_file() else root, name, "stamps")
     searched = [folder] + [folder.parent] * (folder != root and (shared or folder.parent != root))
     files = (directory / file for directory in searched for file in _STAMP_FILES)
     return next((file for file in files if file.is_file()), None)
 
 
-def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
+def require_path(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
     """Return the file or folder ``name`` that densify.yaml gives under ``key``, if it exists."""
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):

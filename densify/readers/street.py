@@ -19,7 +19,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config.cache import Cache, kept, own_folder
+from densify.config.cache import Cache, get_cached, own_folder
 from densify.config.errors import InputError
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
@@ -150,7 +150,7 @@ class Street:
     @cached_property
     def bodies(self) -> Bodies:
         """Poses of the scanner and of all simulated bodies at the reference time of each frame."""
-        return kept(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
+        return get_cached(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
 
     def _render_returns(self, frame: int) -> Returns:
         return self._from_cache(
@@ -170,7 +170,7 @@ class Street:
                 _ = self.simulator.scene.world.triangles  # made once, for all threads
             return render()
 
-        return kept(self._cache, step, lambda: inputs, rendered)
+        return get_cached(self._cache, step, lambda: inputs, rendered)
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the true pose T_world_lidar (4,4) at the sweep's reference time."""

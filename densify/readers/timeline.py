@@ -29,7 +29,7 @@ class WindowFrames(NamedTuple):
     cuts: tuple[str, ...]
 
 
-def runs(frames: Iterable[int]) -> list[range]:
+def find_ranges(frames: Iterable[int]) -> list[range]:
     """Return ascending frame numbers as ranges of consecutive numbers."""
     ranges: list[range] = []
     for frame in frames:
@@ -42,7 +42,10 @@ def runs(frames: Iterable[int]) -> list[range]:
 
 def format_frames(frames: Iterable[int]) -> str:
     """Format frame numbers for messages, as ``96-135, 140``; long lists are shortened."""
-    texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs(sorted(frames))]
+    texts = [
+        f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}"
+        for run in find_ranges(sorted(frames))
+    ]
     if len(texts) > _MOST_RANGES:
         texts = [*texts[: _MOST_RANGES - 1], "...", texts[-1]]
     return ", ".join(texts) if texts else "none"
@@ -123,7 +126,7 @@ class Timeline:
         inside = (self.stamp_ns >= begin_ns) & (self.stamp_ns < end_ns)
         return [self.frames[row] for row in np.flatnonzero(inside)]
 
-    def runs(self, frames: Collection[int]) -> list[list[int]]:
+    def split_at_holes(self, frames: Collection[int]) -> list[list[int]]:
         """Split frames into ascending consecutive series, also at holes over 3.1 median periods."""
         series: list[list[int]] = []  # indices of the sweeps
         for row in sorted(self.row[frame] for frame in frames):
@@ -207,12 +210,12 @@ def _out_of_order(stamps_ns: Int) -> list[int]:
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """Read a sweep and return it after `in_range`, without times if not ``settings.deskew``."""
-    sweep = in_range(sequence[frame], settings)
+    """Read a sweep and return it after `remove_unusable_returns`, without times if not ``settings.deskew``."""
+    sweep = remove_unusable_returns(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
 
 
-def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
+def remove_unusable_returns(sweep: Sweep, settings: RegisterSettings) -> Sweep:
     """Return the sweep without returns that are too near (the own vehicle), too far or lone.
 
     Ranges are from the scanner that fired. Near and lone returns (snow, rain, dust) are counted.

@@ -126,7 +126,7 @@ def read_lasers(segment: Segment) -> dict[int, Laser]:
         if not np.isfinite(bounds if beams_rad is None else beams_rad).all():
             raise InputError(f"{where}: got beams that are not finite, expected rad")
         bounds_rad = float(bounds[0]), float(bounds[1])
-        lasers[int(number)] = Laser(checks.rigid(T, where), beams_rad, bounds_rad)
+        lasers[int(number)] = Laser(checks.pose(T, where), beams_rad, bounds_rad)
     return lasers
 
 
@@ -161,7 +161,7 @@ def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]
                 _whole_us(pose_s),
                 _whole_us((trigger_s + done_s) / 2),
                 max(done_s - trigger_s - shutter_s, 0.0),
-                checks.rigid(T, f"{segment.file('camera_image')}: {name}, frame {frame}"),
+                checks.pose(T, f"{segment.file('camera_image')}: {name}, frame {frame}"),
             )
     return {name: images for name, images in images_of_camera.items() if images}
 
@@ -185,7 +185,7 @@ def read_cameras(
         readout_s = float(np.median([image.readout_s for image in camera_images.values()]))
         x, y = _READOUT.get(direction, (0.0, 0.0))
         T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(
-            checks.rigid(columns["extrinsic.transform"][row], where)
+            checks.pose(columns["extrinsic.transform"][row], where)
         )
         yield (
             name,
@@ -316,11 +316,11 @@ class Waymo(FileSequence):
         kinds = {STAMP: "i", "world_from_vehicle.transform": "l"}
         columns = self._segment.read("vehicle_pose", kinds)
         T_of_start = {
-            int(us): checks.rigid(values, f"{where}: frame_timestamp_micros {us}")
+            int(us): checks.pose(values, f"{where}: frame_timestamp_micros {us}")
             for us, values in zip(*columns.values(), strict=True)
         }
         T_of_frame = {f: T_of_start[us] for f, us in enumerate(self._starts_us) if us in T_of_start}
-        return {f: checks.of_frame(T_of_frame, f, "vehicle pose", where) for f in self.frames}
+        return {f: checks.find_entry(T_of_frame, f, "vehicle pose", where) for f in self.frames}
 
     @cached_property
     def _track(self) -> PoseTrack:
@@ -331,4 +331,6 @@ class Waymo(FileSequence):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         where = {CAMERA: CAMERAS.index(camera.name) + 1, STAMP: int(self._starts_us[number])}
         columns = self._segment.read("camera_image", {"image": "b"}, where)
-        return checks.decoded_image(columns["image"][0], camera, self._segment.file("camera_image"))
+        return checks.decode_camera_image(
+            columns["image"][0], camera, self._segment.file("camera_image")
+        )
