@@ -23,32 +23,27 @@ _AROUND_FEW_S, _AROUND_S = 0.5, 0.3
 
 
 def number_field(default: float | None, low: float, high: float) -> Any:
-    """Return a dataclass field for a number with inclusive bounds."""
+    """Return a dataclass field for a number from ``low`` to ``high``, both included."""
     return field(default=default, metadata={"limits": (low, high)})
 
 
 def choice_field(*words: str) -> Any:
-    """Return a dataclass field for a choice among words; the default is the first word."""
+    """Return a dataclass field for one of the texts ``words``; the first one is the default."""
     return field(default=words[0], metadata={"words": words})
 
 
 @dataclass(frozen=True)
 class Section:
-    """The settings of one stage, checked on construction."""
+    """The settings of one stage; construction raises InputError for a value that does not fit."""
 
     def __post_init__(self) -> None:
         for knob in fields(self):
-            value = convert_value(type(self), knob.name, getattr(self, knob.name), "")
+            value = _convert_value(type(self), knob.name, getattr(self, knob.name), "")
             object.__setattr__(self, knob.name, value)
 
 
-def convert_value(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return a user's value converted to the type of its setting.
-
-    Args:
-        section: Class with the setting.
-        value: Value as parsed from YAML.
-    """
+def _convert_value(section: type[Section], key: str, value: Any, where: str) -> Any:
+    """Return a user's value converted to the type of its setting, or raise InputError."""
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
     if optional and value is None:
@@ -104,7 +99,11 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return how far to search beyond the window and the step (0 every sweep), in seconds."""
+        """Return how far around a window motion is searched, and in which steps (0: every sweep), in s.
+
+        ``points_per_s`` is the rate of the lidar: sparse sweeps are searched farther, and all of
+        them.
+        """
         # Sparse sweeps show little of a moving object, so more of them are searched, and farther.
         is_sparse = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
@@ -171,7 +170,10 @@ class OutputSettings(Section):
 
 @dataclass(frozen=True)
 class Config:
-    """The whole configuration, one section per stage; ``Config()`` has the defaults."""
+    """The whole configuration, one section per stage; ``Config()`` has the defaults.
+
+    ``configs/default.yaml`` describes each setting.
+    """
 
     register: RegisterSettings = RegisterSettings()
     flow: FlowSettings = FlowSettings()
@@ -187,7 +189,7 @@ class Config:
         return self.output.score or self.output.report
 
     def scored(self) -> Config:
-        """Return this configuration with ``output.score`` set."""
+        """Return a copy of this configuration with ``output.score`` set to True."""
         return replace(self, output=replace(self.output, score=True))
 
 
@@ -197,11 +199,16 @@ _SECTIONS: dict[str, Any] = {f.name: type(f.default) for f in fields(Config)}
 def resolve(
     config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> Config:
-    """Return the settings given by ``config``, then changed by the overrides.
+    """Return the settings that ``config`` gives, changed by the overrides.
 
-    ``config`` is None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to
-    a YAML file of that form; or a str, the name of a preset or else of a file. Settings that are
-    not given have their defaults. Overrides are ``section.key=value``, with values as in YAML.
+    Args:
+        config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a
+            YAML file of that form; or a str, the name of a preset or else of a file. Settings that
+            are not given have their defaults.
+        overrides: Texts ``section.key=value``, with values as in YAML. Later ones win.
+
+    Raises:
+        InputError: A file, section or key does not exist, or a value does not fit its setting.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):
@@ -219,7 +226,7 @@ def resolve(
 
 
 def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` with every setting; `resolve` inverts it."""
+    """Return every setting as ``{section: {key: value}}``, from which `resolve` makes it again."""
     return asdict(config)
 
 
@@ -234,7 +241,7 @@ def find_changes(config: Config) -> dict[str, dict[str, Any]]:
 
 
 def presets() -> dict[str, Path]:
-    """Return the YAML file of each preset, by name."""
+    """Return the path of the YAML file of each preset, by the preset's name."""
     package = Path(__file__).parents[1]
     inside = package / "configs"  # installed
     folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
@@ -255,7 +262,11 @@ def apply_overrides(
     overrides: Iterable[str],
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``."""
+    """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``.
+
+    ``sections`` has the class of each section. InputError for a text of another form, an unknown
+    key, or a value that does not fit.
+    """
     for override in overrides:
         where = f"--set {override}"
         name, equals, text = override.partition("=")
@@ -285,7 +296,7 @@ def _apply_changes(
                 owners = [section for section, known in values.items() if key in known]
                 hint = f"did you mean {owners[0]}.{key}?" if owners else hint
                 raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
-            values[name][key] = convert_value(sections[name], key, value, f"{where}: ")
+            values[name][key] = _convert_value(sections[name], key, value, f"{where}: ")
 
 
 def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:

@@ -40,11 +40,11 @@ class Plugin:
 
     @property
     def usage(self) -> str:
-        """Name and argument as users write them."""
+        """Name and argument as users write them, such as ``npz:DIR``."""
         return f"{self.name}:{self.argument}" if self.argument else self.name
 
     def load_module(self) -> Any:
-        """Import and return the plug-in's module."""
+        """Return the plug-in's module after importing it."""
         return import_module(self.module)
 
 
@@ -58,11 +58,11 @@ class Table:
     built_in: tuple[Plugin, ...]  # plug-ins of densify
 
     def names(self) -> list[str]:
-        """Return the names of all plug-ins, the built-in ones first; import none."""
+        """Return the names of all plug-ins, the built-in ones first, without importing any."""
         return [*self._rows()]
 
     def require(self, name: str, where: str) -> None:
-        """Raise InputError, starting with ``where``, if no plug-in has this name; import none."""
+        """Raise InputError, starting with ``where``, if no plug-in has this name. Import none."""
         rows = self._rows()
         if name not in rows:
             usages = [getattr(row, "usage", row.name) for row in rows.values()]
@@ -72,7 +72,7 @@ class Table:
             )
 
     def plugin(self, name: str, where: str) -> Plugin:
-        """Return the plug-in of this name; another package's module is imported."""
+        """Return the plug-in of this name, imported if of another package; InputError if that fails."""
         self.require(name, where)
         return self._loaded(self._rows()[name])
 
@@ -134,7 +134,7 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Split an engine's ``NAME[:ARGUMENT]`` into name and argument, "" for none, without import."""
+    """Return name and argument ("" for none) of ``NAME[:ARGUMENT]``; InputError if they do not fit."""
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:

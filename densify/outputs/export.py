@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from densify.config.errors import InputError, did_you_mean
-from densify.config.file_content import import_optional
+from densify.config.file_content import import_extra
 from densify.config.plugins import EXPORTS
 from densify.geometry.types import Float32
 from densify.outputs.atomic import plain
@@ -123,7 +123,7 @@ def write_exr(run: FinishedRun, folder: Path) -> None:
 
 def exr_writer() -> Callable[[Path, str, Float32], None]:
     """Return a function that writes a channel by name, (H,W) float32, as an OpenEXR file."""
-    library = import_optional("OpenEXR", "exr", "EXR files")
+    library = import_extra("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
 
     def write(path: Path, channel: str, values: Float32) -> None:

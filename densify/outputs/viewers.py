@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError, OutputError
-from densify.config.file_content import import_optional
+from densify.config.file_content import import_extra
 from densify.geometry import poses
 from densify.geometry.arrays import table
 from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
@@ -85,13 +85,13 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
             frame, since_s, T = sweep["frame"], sweep["since_key_s"], sweep["T_key_lidar"]
             if frame == run.key or (len(runs) == 1 and None not in (since_s, T)):
                 stamp_ns = run.stamp_ns + round(_NS * (since_s or 0.0))
-                points, boxes = cloud.sweep(frame), boxes_at(run.tracks, frame)
+                points, boxes = cloud.sweep(frame), _boxes_at(run.tracks, frame)
                 sweeps.append(ShownSweep(frame, stamp_ns, np.array(T), points, boxes))
         shots = [_shot(run, name) for name in run.views]
         yield Timeline(run.key, T_world_key, cloud, sweeps, shots, run.tracks)
 
 
-def boxes_at(tracks: Sequence[ObjectTrack], frame: int) -> list[ShownBox]:
+def _boxes_at(tracks: Sequence[ObjectTrack], frame: int) -> list[ShownBox]:
     """Return the boxes of the objects at the time of a sweep."""
     boxes = []
     for track in tracks:
@@ -114,7 +114,7 @@ def _shot(run: FinishedRun, name: str) -> Shot:
 
 def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``recording.mcap``. Equal runs give equal bytes."""
-    foxglove = import_optional("foxglove", "mcap", "MCAP files")
+    foxglove = import_extra("foxglove", "mcap", "MCAP files")
     context, channels = foxglove.Context(), {}
     options = foxglove.mcap.MCAPWriteOptions(compression_threads=0)
     messages = _FoxgloveMessages(foxglove.messages)
@@ -265,7 +265,7 @@ def show_in_rerun(runs: Sequence[FinishedRun]) -> None:
 
 def _rerun_stream(runs: Sequence[FinishedRun]) -> Any:
     """Return a new recording of rerun."""
-    rr = import_optional("rerun", "rerun", "Recordings for rerun")
+    rr = import_extra("rerun", "rerun", "Recordings for rerun")
     name = f"key-{runs[0].key}-{runs[-1].key}"
     stream = rr.RecordingStream("densify", recording_id=name, send_properties=False)
     stream.set_log_time_enabled(False)
@@ -344,7 +344,7 @@ def _rerun_pose(T: Float) -> Any:
 
 def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
     """Show points and boxes, with a time line of several runs, until the window is closed."""
-    o3d, shown = import_optional("open3d", "open3d", "Windows with the cloud"), []
+    o3d, shown = import_extra("open3d", "open3d", "Windows with the cloud"), []
     for time, timeline in enumerate(timelines(runs)):
         cloud = timeline.cloud
         for group, keep in (("static", ~cloud.moving), ("moving", cloud.moving)):
@@ -354,7 +354,7 @@ def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
             geometry.transform(timeline.T_world_key)
             name = f"key {timeline.key}, {group}"
             shown.append({"name": name, "geometry": geometry, "group": group, "time": time})
-        for box in boxes_at(timeline.tracks, timeline.key):
+        for box in _boxes_at(timeline.tracks, timeline.key):
             T = timeline.T_world_key @ box.T_key_object
             geometry = o3d.geometry.OrientedBoundingBox(T[:3, 3], T[:3, :3], box.size_m)
             name = f"key {timeline.key}, object {box.instance}"

@@ -83,7 +83,7 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
     return cameras[name]
 
 
-def decode_camera_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
+def decode_rgb(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
     """Decode an image file's bytes to (H,W,3) uint8 RGB; a gray image has three equal channels."""
     bgr = decode_image(data, where)
     check_image_size(bgr.shape, camera, where)

@@ -18,13 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import (
-    decompress_gzip,
-    import_optional,
-    open_file,
-    read_bytes,
-    reason,
-)
+from densify.config.file_content import gunzip, import_extra, open_file, read_bytes, reason
 
 # Letter of a kind -> words for messages, and kinds of NumPy types (a text) or names of Arrow types
 _KINDS = {
@@ -55,9 +49,9 @@ def read_arrow(
         where: Name of a column -> value that the rows to read have there, for a parquet file; None
             for all rows.
     """
-    import_optional("pyarrow", *data_set)
+    import_extra("pyarrow", *data_set)
     is_feather = path.suffix == ".feather"
-    library = import_optional("pyarrow.feather" if is_feather else "pyarrow.parquet", *data_set)
+    library = import_extra("pyarrow.feather" if is_feather else "pyarrow.parquet", *data_set)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected the columns {', '.join(columns)} in it")
     open_file(path).close()  # raises a clearer error if the file cannot be opened
@@ -163,7 +157,7 @@ def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
     """
     data = read_bytes(path)
     try:
-        return _pickled_columns(_Unpickler(io.BytesIO(decompress_gzip(data, path))).load())
+        return _pickled_columns(_Unpickler(io.BytesIO(gunzip(data, path))).load())
     except Exception as error:  # a damaged file can raise any type
         raise InputError(
             f"{path}: not a gzipped pandas data frame of numbers and texts ({reason(error)}); "

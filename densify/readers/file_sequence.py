@@ -104,7 +104,7 @@ class FileSequence(ABC):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """Return an existing image, (H,W,3) uint8 RGB."""
         path = self._image_files[camera.name][number]
-        return checks.decode_camera_image(read_bytes(path), camera, path)
+        return checks.decode_rgb(read_bytes(path), camera, path)
 
     def _pose(self, frame: int) -> Float:
         """Return the (4,4) T_world_lidar of an existing sweep; InputError without poses."""

@@ -33,13 +33,7 @@ from densify.readers.folder_config import NAME, CameraFiles, FolderConfig, Sweep
 from densify.readers.point_fields import Columns, PointLayout, PointTimes, sample_columns
 from densify.readers.point_files import SUFFIXES, read_table
 from densify.readers.recorded_poses import PoseFile, PoseTrack, transform_from_world
-from densify.readers.stamped_files import (
-    NamedFile,
-    Series,
-    files_below,
-    order_by_time,
-    require_path,
-)
+from densify.readers.stamped_files import NamedFile, Series, files_below, order_files, require_path
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _SEARCH_DEPTH = 2  # levels of subfolders
@@ -202,7 +196,7 @@ class Folder(FileSequence):
         self._config = FolderConfig.read(folder)
         settings, cameras = self._config.sweeps, self._config.cameras
         files = _find_sweeps(folder, settings.files)
-        sweeps = order_by_time(folder, files, settings.stamps, settings.stamps_unit)
+        sweeps = order_files(folder, files, settings.stamps, settings.stamps_unit)
         self._columns = SweepColumns(sweeps, settings, self._config.path)
         images = {name: _find_images(folder, name, files) for name, files in cameras.items()}
         super().__init__(
@@ -356,4 +350,4 @@ def _find_images(folder: Path, name: str, config: CameraFiles) -> Series:
         key = f"cameras: {{{name}: {{files: {config.files}}}}}"
         raise InputError(f"{folder / config.files}: no images, though densify.yaml names it: {key}")
     (paths,) = below.values()
-    return order_by_time(folder, paths, config.stamps, config.stamps_unit, shared=False)
+    return order_files(folder, paths, config.stamps, config.stamps_unit, shared=False)

@@ -58,7 +58,7 @@ def stamp_ns(record: Record) -> int:
     return int(np.int64(int(record["timestamp"]) * 1000))
 
 
-def pose_of(record: Record, where: str) -> Float:
+def _pose_of(record: Record, where: str) -> Float:
     """Return the (4,4) pose (m) of a record with a quaternion w x y z and a translation."""
     return checks.quaternion_pose(record["rotation"], record["translation"], where)
 
@@ -135,7 +135,7 @@ class Annotations:
                         f"expected one"
                     )
                 size_m = np.array(record["size"], np.float64)[_LENGTH_WIDTH_HEIGHT]
-                boxes[sample][instance] = KeyBox(pose_of(record, where), size_m)
+                boxes[sample][instance] = KeyBox(_pose_of(record, where), size_m)
         key_ns = np.array([stamp_ns(samples[token]) for token in order], np.int64)
         return Annotations(str(path), key_ns, (*boxes.values(),)) if any(boxes.values()) else None
 
@@ -213,7 +213,7 @@ def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseT
             f"{len(records)} records in sample_data.json"
         )
     T_world_ego = {
-        stamp_ns(record): pose_of(record, f"{poses_file}: record {token}")
+        stamp_ns(record): _pose_of(record, f"{poses_file}: record {token}")
         for token, record in poses.items()
     }
     stamps_ns = sorted(T_world_ego)
@@ -230,7 +230,7 @@ def _channels(tables: Path, records: Sequence[Record]) -> dict[str, Channels]:
     path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
     tokens = {record["calibrated_sensor_token"] for record in records}
-    T = {token: pose_of(calibrated[token], f"{path}: record {token}") for token in tokens}
+    T = {token: _pose_of(calibrated[token], f"{path}: record {token}") for token in tokens}
     channels: dict[str, Channels] = defaultdict(lambda: defaultdict(dict))
     for record in records:
         token = record["calibrated_sensor_token"]

@@ -7,7 +7,7 @@ to the accuracy of a packet, stamped when the computer captured its last packet.
 the ends are left out. ``offset_ns`` is computed from the packets' clock and the firing order.
 
 Ouster (extra ``ouster``): the ``.json`` metadata of the sensor is named after ``#``, or found by
-`find_metadata`. A sweep is a frame of the sensor, stamped when the computer captured its first
+`_find_metadata`. A sweep is a frame of the sensor, stamped when the computer captured its first
 packet. The sensor's clock gives the firing times of columns since the first. Rays start on the
 spinning axis, the origin is on the base. Rows follow the range image. Of two returns of a ray the
 first is read.
@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import import_optional, open_file, read_json, reason
+from densify.config.file_content import import_extra, open_file, read_json, reason
 from densify.geometry.types import Int
 from densify.readers.file_sequence import FileSequence, Returns
 
@@ -65,7 +65,7 @@ def open_recording(path: Path, scene: str | None) -> FileSequence:
         raise InputError(f"{path}: no such file; expected a capture of packets (.pcap)")
     if scene in MODELS:
         return Velodyne(path, scene)
-    metadata = find_metadata(path) if scene is None else path.with_name(scene)
+    metadata = _find_metadata(path) if scene is None else path.with_name(scene)
     if metadata is not None and metadata.is_file():
         return Ouster(path, metadata)
     got = "no model and no metadata" if scene is None else f"the model or metadata {scene}"
@@ -77,7 +77,7 @@ def open_recording(path: Path, scene: str | None) -> FileSequence:
     )
 
 
-def find_metadata(path: Path) -> Path | None:
+def _find_metadata(path: Path) -> Path | None:
     """Return a capture's .json: the longest name that begins its own, or the only one; or None."""
     json_files = sorted(path.parent.glob("*.json"))
     named = [p for p in json_files if path.stem.startswith(p.stem)]
@@ -96,7 +96,7 @@ class Velodyne(FileSequence):
     """A Velodyne capture as a `LidarSequence`, stamped at the last packet of each sweep."""
 
     def __init__(self, path: Path, model: str) -> None:
-        self._library = import_optional("velodyne_decoder", "velodyne", "Velodyne captures")
+        self._library = import_extra("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
         packets, num_twice = _once(_find_packets(path))
         self._begin, self._captured_ns, azimuth, clock_us = packets
@@ -205,7 +205,7 @@ class Ouster(FileSequence):
     def __init__(self, path: Path, metadata: Path) -> None:
         # The decoder's modules
         core, pcap = (
-            import_optional(f"ouster.sdk.{name}", "ouster", "Ouster captures")
+            import_extra(f"ouster.sdk.{name}", "ouster", "Ouster captures")
             for name in ("core", "pcap")
         )
         read_json(metadata)

@@ -239,7 +239,7 @@ def full_scale(intensity: NDArray[Any]) -> float:
     return next((scale for scale in _FULL_SCALES if greatest <= scale), greatest)
 
 
-def scale_intensity(intensity: NDArray[Any], scale: float) -> Float32:
+def rescale(intensity: NDArray[Any], scale: float) -> Float32:
     """Return intensities divided by ``scale`` and clipped to 0 to 1; NaN and infinity give 0."""
     share = np.nan_to_num(intensity.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / scale
     return np.clip(share, 0, 1).astype(np.float32)
@@ -309,7 +309,7 @@ class PointLayout:
             valid &= np.isfinite(columns[self.fields.lidar])
         intensity = None
         if self.fields.intensity:
-            intensity = scale_intensity(columns[self.fields.intensity], self.intensity_scale)
+            intensity = rescale(columns[self.fields.intensity], self.intensity_scale)
         offset_ns = None
         num_untimed = 0
         if self.times is not None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import import_optional, open_file, reason
+from densify.config.file_content import import_extra, open_file, reason
 from densify.geometry.types import Bool, Camera, Float32, Prior
 from densify.readers import checks
 from densify.readers.decoded_files import check_pixels, read_array, read_image
@@ -113,7 +113,7 @@ def _read_values(path: Path) -> Float32:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     """Read the channel of depth of an EXR file."""
-    library = import_optional("OpenEXR", "exr", "EXR files")
+    library = import_extra("OpenEXR", "exr", "EXR files")
     open_file(path).close()
     try:
         header = library.File(str(path), header_only=True).header()

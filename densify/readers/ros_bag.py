@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import import_optional, open_file, reason
+from densify.config.file_content import import_extra, open_file, reason
 from densify.geometry.types import Camera, Float
 from densify.readers import checks
 from densify.readers.decoded_files import decode_image
@@ -112,7 +112,7 @@ class Bag:
         for file in self._files:
             for data_file in [file] if file.is_file() else file.glob("*.*"):
                 open_file(data_file).close()  # raises a clear error for an unreadable file
-        package = import_optional(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
+        package = import_extra(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
         # Indexed messages without a header stamp, and messages recorded twice, by topic
         self.num_unstamped = Counter[str]()
@@ -203,7 +203,7 @@ class Bag:
 def message_types(is_ros2: bool) -> Any:
     """Return the rosbags type store with the standard, /tf and Livox message types."""
     # Definitions in a bag are not used, because rosbags turns definitions into executable code.
-    typesys = import_optional("rosbags.typesys", "ros", "ROS bags")
+    typesys = import_extra("rosbags.typesys", "ros", "ROS bags")
     stores = typesys.Stores
     types = typesys.get_typestore(stores.ROS2_JAZZY if is_ros2 else stores.ROS1_NOETIC)
     for name, text in _DEFINITIONS.items():

@@ -30,7 +30,7 @@ _SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
 _MAX_NUMBER_DIGITS = 18  # a longer number is no frame number
 
 
-def in_ns(text: str, unit: str) -> int:
+def _to_ns(text: str, unit: str) -> int:
     """Convert a decimal number in ``unit`` to ns, exactly; raise ValueError if impossible."""
     try:
         value = Decimal(text)
@@ -56,7 +56,7 @@ def _epoch_unit(text: str) -> str:
     """Return the unit in which a number is a time from 2000 to 2099, "" if no unit fits."""
     for unit in UNIT_NS:
         try:
-            if _EPOCH_NS[0] <= in_ns(text, unit) < _EPOCH_NS[1]:
+            if _EPOCH_NS[0] <= _to_ns(text, unit) < _EPOCH_NS[1]:
                 return unit
         except ValueError:
             continue
@@ -113,7 +113,7 @@ class TextTable(NamedTuple):
         times_ns = []
         for line, text in zip(self.lines, times, strict=True):
             try:
-                times_ns.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, known or "s"))
+                times_ns.append(date_ns(text.rstrip("Z")) if dates else _to_ns(text, known or "s"))
             except ValueError:
                 raise InputError(
                     f"{self.path}: line {line}: got {text!r}, expected a time in {known or 's'}, "
@@ -208,14 +208,14 @@ class NamedFile(NamedTuple):
         words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
         if unit:
             try:
-                return NamedFile(path, None, in_ns(words[-1] if words else "", unit))
+                return NamedFile(path, None, _to_ns(words[-1] if words else "", unit))
             except ValueError:
                 return NamedFile(path, None, None)
         for word in reversed(words):
             epoch = _epoch_unit(word)
             # Ten digits without a fraction are a frame number, as in KITTI's file names.
             if epoch and (epoch != "s" or "." in word) and not word.startswith("0"):
-                return NamedFile(path, None, in_ns(word, epoch))
+                return NamedFile(path, None, _to_ns(word, epoch))
         digits = [word for word in re.findall(r"\d+", path.stem) if len(word) <= _MAX_NUMBER_DIGITS]
         return NamedFile(path, int(digits[-1]) if digits else None, None)
 
@@ -230,7 +230,7 @@ class Series:
     stamped_by: str  # source of the stamps, for people; "" without stamps
 
 
-def order_by_time(
+def order_files(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
     """Order files by time and find their stamps; files whose names are times are numbered from 0.

@@ -114,7 +114,7 @@ class Image(NamedTuple):
     T_world_vehicle: Float  # (4,4) pose of the vehicle in the world
 
 
-def read_lasers(segment: Segment) -> dict[int, Laser]:
+def _read_lasers(segment: Segment) -> dict[int, Laser]:
     """Return the lidars' calibrations by Waymo's number, from 1 (TOP)."""
     beams, low, high = (f"beam_inclination.{key}" for key in ("values", "min", "max"))
     kinds = {LASER: "i", "extrinsic.transform": "l", beams: "l", low: "m", high: "m"}
@@ -130,7 +130,7 @@ def read_lasers(segment: Segment) -> dict[int, Laser]:
     return lasers
 
 
-def read_boxes(segment: Segment) -> dict[int, Boxes]:
+def _read_boxes(segment: Segment) -> dict[int, Boxes]:
     """Return boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
     numbers = [f"box.{key}.{axis}" for key in ("center", "size") for axis in "xyz"]
     kinds = {STAMP: "i", OBJECT: "s", **dict.fromkeys((*numbers, "box.heading"), "n")}
@@ -145,7 +145,7 @@ def read_boxes(segment: Segment) -> dict[int, Boxes]:
     return boxes
 
 
-def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
+def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
     """Return times and poses of images by camera and frame; ``starts_us`` (n,) are the frames'."""
     keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
     seconds = ("pose_timestamp", *(f"rolling_shutter_params.{key}" for key in keys))
@@ -166,7 +166,7 @@ def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]
     return {name: images for name, images in images_of_camera.items() if images}
 
 
-def read_cameras(
+def _read_cameras(
     segment: Segment, images: Mapping[str, Mapping[int, Image]]
 ) -> Iterator[tuple[str, Camera]]:
     """Yield the calibrated cameras that have images, with their names and rolling shutters."""
@@ -229,9 +229,9 @@ class Waymo(FileSequence):
         self._period_ns = int(np.median(steps_ns)) if len(steps_ns) else _NOMINAL_PERIOD_NS
         has_images = segment.file("camera_image").is_file()
         with described_in(root, f"calibration and images of {context} in the data set's own form"):
-            self._lasers = read_lasers(segment)
-            self._images = read_images(segment, self._starts_us) if has_images else {}
-            cameras = dict(read_cameras(segment, self._images)) if has_images else {}
+            self._lasers = _read_lasers(segment)
+            self._images = _read_images(segment, self._starts_us) if has_images else {}
+            cameras = dict(_read_cameras(segment, self._images)) if has_images else {}
         front = self._images.get(CAMERAS[0], {})
         self._stamps_ns = [
             front[frame].pose_ns if frame in front else int(ns) + self._period_ns // 2
@@ -254,7 +254,7 @@ class Waymo(FileSequence):
 
     @cached_property
     def _boxes(self) -> dict[int, Boxes]:
-        return read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
+        return _read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the pose T_world_cam (4,4) at the middle of the exposure of image ``number``."""
@@ -331,6 +331,4 @@ class Waymo(FileSequence):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         where = {CAMERA: CAMERAS.index(camera.name) + 1, STAMP: int(self._starts_us[number])}
         columns = self._segment.read("camera_image", {"image": "b"}, where)
-        return checks.decode_camera_image(
-            columns["image"][0], camera, self._segment.file("camera_image")
-        )
+        return checks.decode_rgb(columns["image"][0], camera, self._segment.file("camera_image"))
