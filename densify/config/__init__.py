@@ -99,10 +99,10 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return how far around a window motion is searched, and in which steps (0: every sweep), in s.
+        """Return two times in seconds: how far around a window motion is searched, and its step.
 
-        ``points_per_s`` is the rate of the lidar: sparse sweeps are searched farther, and all of
-        them.
+        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar: sparse sweeps are
+        searched farther, and all of them.
         """
         # Sparse sweeps show little of a moving object, so more of them are searched, and farther.
         is_sparse = points_per_s < _FEW_POINTS_PER_S

@@ -53,7 +53,7 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def gunzip(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return decompressed gzip data; InputError if damaged, empty, or unpacked over ``most_bytes``."""
+    """Return decompressed gzip data; InputError if damaged, empty or too large unpacked."""
     try:
         with gzip.open(io.BytesIO(data)) as file:
             content = file.read(most_bytes + 1)
@@ -176,7 +176,7 @@ def import_extra(module: str, extra: str, needed_by: str) -> Any:
 
 @contextmanager
 def described_in(where: Path | str, expected: str) -> Iterator[None]:
-    """Turn malformed content in the block into an InputError of file ``where`` with ``expected``."""
+    """Turn malformed content in the block into an InputError of ``where`` with ``expected``."""
     try:
         yield
     except InputError:

@@ -72,7 +72,7 @@ class Table:
             )
 
     def plugin(self, name: str, where: str) -> Plugin:
-        """Return the plug-in of this name, imported if of another package; InputError if that fails."""
+        """Return the plug-in of this name; InputError if there is none or it cannot be imported."""
         self.require(name, where)
         return self._loaded(self._rows()[name])
 
@@ -134,7 +134,11 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Return name and argument ("" for none) of ``NAME[:ARGUMENT]``; InputError if they do not fit."""
+    """Return the name and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``.
+
+    No module is imported. InputError if no engine has this name, or if a built-in engine has an
+    argument too many or lacks its argument.
+    """
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:

@@ -29,13 +29,7 @@ from densify.outputs.atomic import plain, write_file
 from densify.outputs.recording_folder import drive_folder, is_same, split_of
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
-from densify.readers.timeline import (
-    Timeline,
-    check_window,
-    choose_cameras,
-    find_ranges,
-    format_frames,
-)
+from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, to_runs
 from densify.version import __version__
 
 SCHEMA_VERSION = 1
@@ -312,7 +306,7 @@ def _read_camera(name: str, stored: Mapping[str, Any]) -> Camera:
 
 def _as_runs(frames: Iterable[int]) -> list[list[int]]:
     """Return ascending frame numbers as runs [first, last]."""
-    return [[run[0], run[-1]] for run in find_ranges(frames)]
+    return [[run[0], run[-1]] for run in to_runs(frames)]
 
 
 def _frames(ends: Iterable[Sequence[int]]) -> list[int]:

@@ -49,7 +49,7 @@ def export_run(
     cameras: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> Export:
-    """Write a finished run in another format, from its files alone.
+    """Write a finished run in another format, from its files alone, and say what it holds.
 
     Args:
         run: Folder of one key sweep, or of several for formats of whole drives.
@@ -58,7 +58,11 @@ def export_run(
         min_confidence: Least confidence of pixels and points, 0 to 1.
         max_age_ms: Greatest time from the measurement to the exposure (pixels) or the key sweep
             (points); None for any.
-        overwrite: Replace an earlier export.
+        cameras: Names of the cameras, None for all.
+        overwrite: True to replace an earlier export.
+
+    Raises:
+        InputError: An argument is out of range or unknown, the run is damaged, or files exist.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")
@@ -91,7 +95,7 @@ def export_run(
 
 
 def facts(export: Export) -> dict[str, Any]:
-    """Return the fields ``density`` and ``num_points`` of export.yaml, each only if known."""
+    """Return the known ones of the fields ``density`` and ``num_points`` of export.yaml."""
     density = {
         camera: {product: kept._asdict() for product, kept in products.items()}
         for camera, products in export.density.items()
@@ -122,7 +126,7 @@ def write_exr(run: FinishedRun, folder: Path) -> None:
 
 
 def exr_writer() -> Callable[[Path, str, Float32], None]:
-    """Return a function that writes a channel by name, (H,W) float32, as an OpenEXR file."""
+    """Return a function that writes (H,W) float32 as an OpenEXR file: path, channel, values."""
     library = import_extra("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
 

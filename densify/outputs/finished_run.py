@@ -97,7 +97,10 @@ class LoadedResult:
 
 
 def load_result(folder: str | Path) -> LoadedResult:
-    """Return the arrays of a finished run from its folder, such as densify-out/street/000120."""
+    """Return the arrays of a finished run from its folder, such as densify-out/street/000120.
+
+    InputError if a file of the run is missing or damaged.
+    """
     run = FinishedRun(Path(folder))
     with _damage_named(run.folder / "metrics.json"):
         metrics = read_json(run.folder / "metrics.json")
@@ -125,7 +128,7 @@ class FinishedRun:
     """The folder of one densified key sweep. Files are read on demand and may raise InputError."""
 
     def __init__(self, folder: Path, thresholds: Thresholds = EVERYTHING) -> None:
-        """Open a folder with run.yaml; raise InputError without it."""
+        """Open a folder with run.yaml, to read within ``thresholds``; InputError without it."""
         path = folder / "run.yaml"
         if not path.is_file():
             raise InputError(
@@ -213,6 +216,7 @@ class FinishedRun:
         """Return the (H,W) stored values of a camera's maps, 0 beyond a threshold.
 
         The keys are depth, depth_filled, confidence and age, values of `densify.outputs.depth_png`.
+        This also enters the shares of pixels into ``density``.
         """
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
@@ -257,7 +261,7 @@ class FinishedRun:
 
 
 def finished_runs(folder: Path, thresholds: Thresholds = EVERYTHING) -> list[FinishedRun]:
-    """Return the run in a folder, or those up to two levels below, by parent folder and frame."""
+    """Return the run in a folder, else those up to two levels below, by parent folder and key."""
     paths = [path for depth in ("*", "*/*") for path in folder.glob(f"{depth}/run.yaml")]
     folders = sorted(path.parent for path in paths)
     if (folder / "run.yaml").is_file() or not folders:

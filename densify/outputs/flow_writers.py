@@ -41,7 +41,11 @@ flow to the previous sweep instead."""
 def flow_writer(
     form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
 ) -> Iterator[FlowWriter]:
-    """Yield a function that writes the flow of one sweep as ``form``; ``frames`` ascend."""
+    """Yield a function that writes the flow of one sweep, a `FlowWriter`.
+
+    ``form`` is npz, av2, opensceneflow, semantickitti or doc-depth. ``frames``, of the sweeps to
+    write, ascend. InputError if files exist in ``out``, unless ``overwrite`` replaces them.
+    """
     paths = {frame: _path_of(form, sequence, out, frame) for frame in frames}
     if form == "av2":
         import_extra("pyarrow.feather", "argoverse", "Argoverse 2's flow files")

@@ -194,7 +194,7 @@ def write_curve(result: Result, folder: Path) -> None:
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw the share of outliers over the density: title -> method -> `precision_density`."""
+    """Return a figure of outliers over density: title of the axes -> method -> `Curve`."""
     from matplotlib.figure import Figure
 
     columns, rows = min(2, len(curves)), -(-len(curves) // 2)

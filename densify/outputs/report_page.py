@@ -126,7 +126,7 @@ class KeyFiles:
         return maps
 
     def image(self, name: str) -> bytes | None:
-        """Return the JPEG bytes of the image of a map, None if the run has no image."""
+        """Return the JPEG bytes of the image of a map, None if it is missing or damaged."""
 
         def jpeg(path: Path) -> bytes:
             decode_image(data := read_bytes(path), path)
@@ -321,7 +321,7 @@ def pack_cloud(
 
 
 def thin_cloud(points: Float, moving: Bool, max_points: int) -> Int:
-    """Return (K,) ascending indices of at most ``max_points`` points, the far ones preferred."""
+    """Return (K,) ascending indices of ``max_points`` points at most, mostly far or moving ones."""
     if len(points) <= max_points:
         return np.arange(len(points))
     weight = np.maximum((points**2).sum(axis=1), _NEAR_M**2)
@@ -346,7 +346,11 @@ def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
 
 
 def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
-    """Return the bytes of a whole HTML page, whose script reads ``data`` as ``page``."""
+    """Return the bytes of a whole HTML page.
+
+    Its script reads ``data`` as ``page``, of types that `plain` accepts, and unpacks ``blobs``, to
+    which ``data`` refers by name.
+    """
     script, style = "\n".join(map(_source, _SCRIPTS)), _source("page.css")
     policy = (
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; "

@@ -249,14 +249,14 @@ def _ros_lens(camera: Camera) -> tuple[str, list[float]] | None:
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.rrd``. Bytes differ each time: rerun numbers its chunks by the clock."""
+    """Write ``recording.rrd``; the bytes differ each time, as rerun numbers chunks by the clock."""
     with _rerun_stream(runs) as stream:
         stream.save(folder / "recording.rrd")
         _log_to_rerun(stream, runs)
 
 
 def show_in_rerun(runs: Sequence[FinishedRun]) -> None:
-    """Show the runs in rerun's viewer, which stays open. Raise InputError as `write_rrd`."""
+    """Show the runs in rerun's viewer, which stays open; InputError without the package."""
     with _rerun_stream(runs) as stream:
         stream.spawn()
         _log_to_rerun(stream, runs)
@@ -369,7 +369,7 @@ def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
 
 
 def write_mp4(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``video/CAMERA.mp4`` with a frame for each map, ascending in time."""
+    """Write ``video/CAMERA.mp4`` with a frame for each map, in the order of runs and images."""
     shots = [(run, name) for run in runs for name in run.cameras]
     (folder / "video").mkdir()
     for camera in dict.fromkeys(name.partition("/")[0] for _, name in shots):

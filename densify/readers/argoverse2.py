@@ -39,7 +39,7 @@ _FX_FY_CX_CY = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
-    """Open a log by its folder; or, with its name as ``scene``, by its split or the data set."""
+    """Return the log in a folder; or the log ``scene`` of a split's or the data set's folder."""
     if scene is None and (path / _TRACK).is_file():
         return Argoverse2(path)
     folders = (path, path / "train", path / "val", path / "test")

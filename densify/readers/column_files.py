@@ -42,12 +42,15 @@ def read_arrow(
 
     Args:
         path: File whose suffix is .feather or .parquet.
-        columns: Name of a column -> its kind: "n" finite numbers, "m" numbers or NaN, "i"
-            integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of
-            arrays or None).
+        columns: Name of a column -> its kind: "n" finite numbers, "m" numbers or NaN, "i" integers,
+            "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of arrays or
+            None).
         data_set: Extra that installs pyarrow, and the name of the recordings for messages.
         where: Name of a column -> value that the rows to read have there, for a parquet file; None
             for all rows.
+
+    Raises:
+        InputError: The file is missing or damaged, or a column is missing or of another kind.
     """
     import_extra("pyarrow", *data_set)
     is_feather = path.suffix == ".feather"
@@ -153,7 +156,8 @@ class _Unpickler(pickle._Unpickler):
 def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns (N,) of a gzipped, pickled pandas data frame, by name; no code is run.
 
-    A column of texts holds Python objects, whose type the caller must check.
+    A column of texts holds Python objects, whose type the caller must check. InputError if the file
+    is no such data frame.
     """
     data = read_bytes(path)
     try:

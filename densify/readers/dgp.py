@@ -31,7 +31,7 @@ _BOGUS_YEAR = 2200  # DDAD stores tenths of microseconds as microseconds
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
-    """Open a scene by its folder, or by a folder of scenes with the scene's name."""
+    """Return the scene in a folder; or the scene of this name in a folder of scenes."""
     if scene is None and _scene_files(path):
         return Dgp(path)
     names = sorted(folder.name for folder in path.glob("*/") if _scene_files(folder))

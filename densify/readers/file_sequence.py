@@ -55,7 +55,7 @@ class FileSequence(ABC):
         # PNG or JPEG files by camera and number; a reader without them overrides `_image`
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
-        """Store the files and times that the reader found."""
+        """Store what the reader found; raise InputError if all files of sweeps are empty."""
         self.name = name
         self.where = where
         self.frames: Sequence[int] = frames
@@ -74,7 +74,7 @@ class FileSequence(ABC):
         return in_one_line(self)
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep without reading its points."""
+        """Return the reference time of a sweep in nanoseconds, without reading its points."""
         self.check_frame(frame)
         return int(self._stamps_ns[frame])
 
@@ -114,9 +114,10 @@ class FileSequence(ABC):
         )
 
     def __getitem__(self, frame: int) -> Sweep:
-        """Read a sweep and return its valid points, in file order, at their own firing times.
+        """Return the valid points of a sweep, in file order, at their own firing times.
 
         Rows at 0 0 0 (padding) or not finite are dropped; intensities that are not finite become 0.
+        InputError if the sweep is missing, malformed or without valid points.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower
@@ -157,16 +158,16 @@ class FileSequence(ABC):
         return len(self._checked_returns(frame)[1].points)
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return the exposure time of each existing image of a camera, by image number."""
+        """Return the exposure time (ns) of each existing image of a camera, by image number."""
         checks.camera_named(self.cameras, camera, self.where)
         return self._exposed_ns.get(camera, {})
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Read an image as (H,W,3) RGB; raise InputError if it is missing or of another size."""
+        """Return an image as (H,W,3) uint8 RGB; InputError if it is missing or of another size."""
         return self._image(self.check_image(camera, number), number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the recorded (4,4) pose of the lidar in the world at a sweep's reference time."""
+        """Return the recorded (4,4) lidar pose at a sweep's reference time; InputError without."""
         self.check_frame(frame)
         return checks.pose(self._pose(frame), f"{self.where}: pose of frame {frame}")
 

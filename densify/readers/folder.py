@@ -53,7 +53,7 @@ class SweepColumns:
     _point_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
-        """Read all rows of a sweep, in the lidar frame, by its frame number and reference time."""
+        """Return all rows of a sweep in the lidar frame; ``stamp_ns`` is its reference time."""
         path = self.series.paths[frame]
         columns = self._columns(path)
         returns, valid = self.layout.returns(columns, path, stamp_ns)
@@ -140,14 +140,14 @@ class SweepColumns:
 
     @cached_property
     def period_ns(self) -> int:
-        """The median time between consecutive stamps, or the period of the rate without stamps."""
+        """The median time between stamps in ns; without stamps, the period of the assumed rate."""
         stamps_ns = list((self.series.stamps_ns or {}).values())
         if len(stamps_ns) > 1:
             return max(1, int(np.median(np.diff(stamps_ns))))
         return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
 
     def describe_columns(self) -> str:
-        """Describe the columns in use, and the unused ones with the range of their values."""
+        """Return a text of the columns in use, and of the unused ones with ranges of values."""
         used = {quantity: name for quantity, name in vars(self.layout.fields).items() if name}
         unused = [
             f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
@@ -184,7 +184,7 @@ class SweepColumns:
 
 
 def open_recording(path: Path, scene: str | None) -> Folder:
-    """Open a folder of sweeps; ``scene`` is unused, since a folder has no scenes."""
+    """Return a folder of sweeps; ``scene`` is not used."""
     return Folder(path)
 
 
@@ -231,12 +231,12 @@ class Folder(FileSequence):
         return text
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep."""
+        """Return the reference time of a sweep in nanoseconds."""
         self.check_frame(frame)
         return self._columns.stamp_ns(int(frame))
 
     def gaps(self) -> list[str]:
-        """Return missing parts of the recording and what is assumed instead, a sentence each."""
+        """Return a sentence for each missing part, which says what is assumed instead."""
         notes, drive = self._columns.assumed(), checks.drive_around(self.where)
         if drive is not None:
             notes.append(

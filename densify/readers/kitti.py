@@ -77,7 +77,7 @@ _IMAGES_360 = {
 
 
 def open_recording(path: Path, scene: str | None) -> Drive:
-    """Open a drive or sequence; ``scene`` names one of several in a folder."""
+    """Return the drive or sequence at a path; ``scene`` names one of several in a folder."""
     if (path / "velodyne_points").is_dir():
         return KittiRaw(path)
     if (path / "data_3d_raw").is_dir():
@@ -108,7 +108,7 @@ class Drive(FileSequence):
     def __init__(
         self, name: str, where: Path, sweeps: Path, stamps: Stamps, images: Mapping[str, Path]
     ) -> None:
-        """Find the .bin files in the folder ``sweeps``, and images in a folder of each camera."""
+        """Find .bin files in the folder ``sweeps``, and images in ``images`` (camera -> folder)."""
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
@@ -122,12 +122,12 @@ class Drive(FileSequence):
         self._exposed_ns = {camera: stamps.of(numbers) for camera, numbers in numbered.items()}
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep; raise InputError if the frame has no stamp."""
+        """Return the reference time of a sweep (ns); raise InputError if the frame has no stamp."""
         self.check_frame(frame)
         return self._stamps.at(frame)
 
     def gaps(self) -> list[str]:
-        """Return missing files and what is assumed instead, a sentence each."""
+        """Return a sentence for each missing file, which says what is assumed instead."""
         note = f"{self.where} has no {self._stamps.path.name}: sweeps are taken for 100 ms apart"
         return [] if self._stamps.by_frame else [note]
 
@@ -183,7 +183,7 @@ class KittiRaw(Drive):
         self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
 
     def gaps(self) -> list[str]:
-        """Return missing files and what is assumed instead, a sentence each."""
+        """Return a sentence for each missing file, which says what is assumed instead."""
         velodyne = self.where / "velodyne_points"
         notes = [f"{velodyne} has no {', '.join(self._missing)}"] * bool(self._missing)
         notes += super().gaps()
@@ -361,7 +361,7 @@ class KittiTracking(Drive):
         return T_first_imu(first, record) @ poses.inverse(self._calibration.motion("Tr_imu_velo"))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes (at ``offset_ns``) in the lidar frame; None without labels."""
+        """Return a sweep's boxes at their firing times, in the lidar frame; None without labels."""
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
         if not path.is_file():

@@ -64,7 +64,7 @@ def _pose_of(record: Record, where: str) -> Float:
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return all records of a JSON table, by their tokens."""
+    """Return all records of a JSON table by their tokens; InputError if missing or damaged."""
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
 
@@ -174,7 +174,7 @@ class Annotations:
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
-    """Open a scene, such as ``scene-0061``, by the folder of the JSON tables or by its parent."""
+    """Return a scene, such as ``scene-0061``, of the folder of the JSON tables or its parent."""
     folders = [path] if (path / "sample_data.json").is_file() else []
     folders = folders or sorted(file.parent for file in path.glob("v*/sample_data.json"))
     if not folders:
@@ -194,7 +194,7 @@ class Datum(NamedTuple):
     """A sweep or image of a scene."""
 
     stamp_ns: int
-    path: Path  # of its file, which may be missing on the disk
+    path: Path  # path of its file, which may be missing on the disk
     T_ego_sensor: Float  # (4,4) pose of the sensor in the vehicle's frame
     size_px: tuple[int, int]  # width and height of an image; zeros for a sweep
     intrinsics: Any  # camera matrix (3 x 3) as parsed from JSON

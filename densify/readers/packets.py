@@ -7,7 +7,7 @@ to the accuracy of a packet, stamped when the computer captured its last packet.
 the ends are left out. ``offset_ns`` is computed from the packets' clock and the firing order.
 
 Ouster (extra ``ouster``): the ``.json`` metadata of the sensor is named after ``#``, or found by
-`_find_metadata`. A sweep is a frame of the sensor, stamped when the computer captured its first
+beside the capture. A sweep is a frame of the sensor, stamped when the computer captured its first
 packet. The sensor's clock gives the firing times of columns since the first. Rays start on the
 spinning axis, the origin is on the base. Rows follow the range image. Of two returns of a ray the
 first is read.
@@ -60,7 +60,7 @@ _HALF_WRAP = 1 << 15  # Ouster's packets count turns with 16 bits
 
 
 def open_recording(path: Path, scene: str | None) -> FileSequence:
-    """Open a ``.pcap`` capture; ``scene`` is a Velodyne's model or the name of Ouster metadata."""
+    """Return a ``.pcap`` capture; ``scene`` is a Velodyne's model or an Ouster's metadata file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a capture of packets (.pcap)")
     if scene in MODELS:
@@ -111,7 +111,7 @@ class Velodyne(FileSequence):
         super().__init__(path.stem, path, range(len(self._turns)))
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """Return the number of packets, and of those that are lost or were captured twice."""
+        """Return a pair of "packets" and the numbers of packets read, lost and captured twice."""
         return _packet_counts(*self._packet_counts)
 
     def _returns(self, frame: int) -> Returns:
@@ -235,7 +235,7 @@ class Ouster(FileSequence):
         super().__init__(path.stem, path, range(len(index)))
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """Return the number of packets, and of those that are lost or were captured twice."""
+        """Return a pair of "packets" and the numbers of packets read, lost and captured twice."""
         packets = [p for _, p in self._packets if isinstance(p, self._is_lidar_packet)]
         turn = np.array([p.frame_id() for p in packets], np.int64)
         column = [int(p.format.packet_header(self._column, p.buf)[0]) for p in packets]
@@ -269,9 +269,10 @@ class Ouster(FileSequence):
 
 
 def count_lost_and_repeated(turn: Int, column: Int) -> tuple[int, int]:
-    """Return the number of packets missing between others, and of those captured a second time.
+    """Return the number of packets missing between P others, and of those captured twice.
 
-    ``turn`` (P,) of the packets wraps at 16 bits; ``column`` (P,) is the first column of each.
+    ``turn`` (P,) is the number of each packet's turn, of 16 bits, so that it starts again from 0.
+    ``column`` (P,) is the first column of each packet.
     """
     step = np.diff(turn, prepend=turn[:1])
     turn = np.cumsum((step + _HALF_WRAP) % (2 * _HALF_WRAP) - _HALF_WRAP)

@@ -54,7 +54,7 @@ _LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
 
 
 def open_recording(path: Path, scene: str | None) -> PandaSet:
-    """Open a PandaSet sequence by its folder; a sequence has no scenes."""
+    """Return the PandaSet sequence in a folder; ``scene`` is not used."""
     return PandaSet(path)
 
 

@@ -41,10 +41,10 @@ _MOST_RINGS, _MOST_ELONGATION, _MOST_ASCENDING = 256, 2.0, 0.9
 
 @dataclass(frozen=True)
 class PointTable:
-    """The N points of a file."""
+    """The N points of a file; ``len()`` is N."""
 
-    # Values (N,) of each column as stored, by name. Columns that have no name in the file get the
-    # names of `_default_column_names`.
+    # Values (N,) of each column as stored, by name. Columns without a name in the file are x, y, z,
+    # intensity, column4, column5 and so on.
     columns: Columns
     # Further arrays of an .npz file, by name
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -54,7 +54,10 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Read all rows of a point file, in file order; ``names`` replace the columns of `_default_column_names`.
+    """Return all rows of a point file, in file order; InputError if damaged or without rows.
+
+    ``names`` are the names of the columns, for files that do not name them; None for x, y, z,
+    intensity, column4, column5 and so on.
 
     .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
                 values fit one of them

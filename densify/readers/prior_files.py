@@ -43,7 +43,10 @@ class PriorFiles:
 
     @staticmethod
     def open(path: Path, cameras: Sequence[str]) -> PriorFiles:
-        """Find the prior files of cameras."""
+        """Return the prior files of the cameras in a folder, or of one camera in a file or folder.
+
+        InputError if nothing is found, or if files of one camera have to serve several.
+        """
         where = f"prior {path}"
         example = "0000000120.npy, .exr or .png"
         if not path.exists():
@@ -72,9 +75,9 @@ class PriorFiles:
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
-        """Read an image's prior at the camera's size (H,W); None if it has no prior.
+        """Return an image's prior at the camera's size (H,W); None if it has no prior.
 
-        A prior of another size is resized if its aspect ratio agrees to 2 %.
+        A prior of another size is resized if its aspect ratio agrees to 2 %; else InputError.
         """
         path = self.values[camera.name].get(number)
         if path is None:

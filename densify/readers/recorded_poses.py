@@ -47,7 +47,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return T_world_ego (4,4) at a time, interpolated, or extrapolated by up to 0.2 s."""
+        """Return T_world_ego (4,4) at a time, interpolated, up to 0.2 s beyond; else InputError."""
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
         if beyond_ns > _MAX_BEYOND_NS:
@@ -64,7 +64,7 @@ class PoseTrack:
         return poses.interpolate(self.T_world_ego[before], self.T_world_ego[after], fraction)
 
     def undo_compensation(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
+        """Return points in the vehicle frame at their firing times; undo ego-motion compensation.
 
         Many data sets store a sweep as if measured at one time, which smears moving objects and
         bends rings.
@@ -79,7 +79,7 @@ class PoseTrack:
         return np.where(points.any(axis=1, keepdims=True), fired, points)
 
     def compensate(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Move (N,3) points from their firing times to ``stamp_ns``; the opposite of `undo_compensation`."""
+        """Return (N,3) points moved from firing times to ``stamp_ns``, as data sets store them."""
         return self._carry(points, stamp_ns, offset_ns, inverse=False)
 
     def undo_placement(self, placed: Returns, stamp_ns: int) -> Returns:
@@ -130,10 +130,11 @@ class PoseFile:
     def of_folder(
         folder: Path, name: str, unit: str, sweeps: Mapping[int, Path]
     ) -> PoseFile | None:
-        """Read the poses of a recording; None without any.
+        """Return the poses of a recording; None without any.
 
-        ``name`` is the pose file; "" searches for a usual name, a .pose file beside each sweep, or
-        the viewpoints of .pcd files. ``unit`` is the unit of the times, "" to find it.
+        ``name`` is the pose file. "" searches for a usual name, a .pose file beside each of the
+        ``sweeps`` (file by frame), or the viewpoints of .pcd files. ``unit`` is the unit of the
+        times, "" to find it.
         """
         if name:
             return PoseFile.read(require_path(folder, name, "poses: {file: ...}"), unit)
@@ -148,7 +149,7 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Read a file with a pose on each line; ``unit`` is the times' unit, "" to find it."""
+        """Return the poses of a file, one on each line; ``unit`` is the times', "" to find it."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         columns = [i for names in (*_TURNS, *_POSITIONS) if (i := table.column(names)) is not None]
         width, form, time = len(table.rows[0]), "table with quaternions", None
@@ -199,7 +200,12 @@ class PoseFile:
             return None
 
     def by_frame(self, frames: Sequence[int]) -> dict[int, Float]:
-        """Return the (4,4) poses of ascending ``frames``, listed in order or by number from 0."""
+        """Return frame number -> (4,4) pose; ``frames`` are the recording's, ascending.
+
+        Poses of files for each sweep keep their frames. As many poses as ``frames`` are in their
+        order. More poses than the last frame number belong to the numbers from 0. Otherwise
+        InputError.
+        """
         if self.frames is not None:
             return dict(zip(self.frames, self.T, strict=True))
         if len(self.T) == len(frames):

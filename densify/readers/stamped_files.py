@@ -45,7 +45,7 @@ def _to_ns(text: str, unit: str) -> int:
 
 
 def date_ns(text: str) -> int:
-    """Convert an ISO date in UTC to ns since 1970 without loss; raise ValueError for others."""
+    """Return an ISO date in UTC as ns since 1970, without loss; ValueError for other texts."""
     day = np.datetime64(text, "D")  # numpy wraps years beyond 64 bits
     if not np.datetime64("1970-01-01") <= day < np.datetime64("2262-01-01"):
         raise ValueError(f"got {text!r}, expected a year from 1970 to 2261")
@@ -76,7 +76,7 @@ class TextTable(NamedTuple):
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
-        """Read a file; its first line names columns if it has a known name or begins with #."""
+        """Return the table of a file; the first line has names if one is known or if it has a #."""
         table = TextTable(path, [], [], [])
         for number, line in enumerate(read_text(path).splitlines(), 1):
             text = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", line.strip().strip("#,;").strip())
@@ -98,7 +98,7 @@ class TextTable(NamedTuple):
         return table
 
     def column(self, choices: Collection[str]) -> int | None:
-        """Return the index of the first of the names in ``choices`` that is a column, else None."""
+        """Return the index of the first column among the names ``choices``, None without any."""
         indices = (self.names.index(name) for name in choices if name in self.names)
         return next((index for index in indices if index < len(self.rows[0])), None)
 
@@ -151,7 +151,7 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """Read a time from each line, alone or among columns: a number of ``unit``, or a date."""
+        """Return the times in a file's lines, dates or numbers of ``unit``; "" finds the unit."""
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         time_column = table.column(TIME_COLUMNS)
         name_column = table.column(_FILE_COLUMNS)
@@ -171,7 +171,12 @@ class StampFile(NamedTuple):
         return StampFile(path, stamps_ns, unit, names)
 
     def of(self, paths: Mapping[int, Path]) -> dict[int, int]:
-        """Return the stamps (ns) of files by number; lines belong by name, order or number."""
+        """Return the stamps (ns) of files by their numbers.
+
+        Lines with names belong to the files of these names. As many lines as files are in the
+        files' order. Otherwise line k, from 0, is of the number k. InputError if a file has no
+        line.
+        """
         if self.names is not None:
             by_name = {Path(n).stem: ns for n, ns in zip(self.names, self.stamp_ns, strict=True)}
             missing = [path for path in paths.values() if path.stem not in by_name]
@@ -202,7 +207,7 @@ class NamedFile(NamedTuple):
 
     @staticmethod
     def of(path: Path, unit: str = "") -> NamedFile:
-        """Find the number or the time in a name; with a ``unit`` the last number is a time."""
+        """Return the number or the time in a name; with a ``unit``, its last number is a time."""
         # 0000000120 and cloud_12 are numbers. 1317042651.468569638, 1317042651_468569638 and
         # 1317042651468 are times since 1970.
         words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
@@ -233,10 +238,11 @@ class Series:
 def order_files(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
-    """Order files by time and find their stamps; files whose names are times are numbered from 0.
+    """Return files in the order of time; those whose names are times are numbered from 0.
 
     Args:
-        paths: Files.
+        root: Folder of the recording.
+        paths: Files of sweeps or images, in one folder.
         stamps: "names" if file names are stamps, "sweeps" for files without stamps, the name of a
             stamp file beside the files or below ``root``, or "" to search for one.
         unit: Unit of the stamps, "" to detect it.
@@ -296,7 +302,7 @@ def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | Non
 
 
 def require_path(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
-    """Return the file or folder ``name`` that densify.yaml gives under ``key``, if it exists."""
+    """Return the file or folder ``name`` that densify.yaml gives as ``key``; InputError without."""
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):
         kind = "folder" if is_folder else "file"

@@ -37,7 +37,7 @@ _NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole 
 
 
 class Street:
-    """The built-in simulated street; members as in `LidarSequence`."""
+    """The built-in simulated street, 16 seconds long; members as in `LidarSequence`."""
 
     def __init__(
         self,
@@ -48,12 +48,16 @@ class Street:
         tilt_deg: float = 0.0,
         cameras: tuple[str, ...] = USUAL,
     ) -> None:
-        """Set up the street; sweeps and images are rendered on demand.
+        """Set up the street; sweeps and images are rendered on demand. InputError for other values.
 
         Args:
             preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the
                 ego vehicle stands).
+            seed: Number from 0 that varies the scene.
+            sensor: Name of a lidar in `densify.street.lidar.SENSORS`.
+            hz: Sweeps per second: 5, 10 or 20.
             tilt_deg: Pitch of the lidar's mount, nose down. Cameras are not tilted.
+            cameras: Names of the cameras.
         """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
@@ -78,7 +82,7 @@ class Street:
 
     @staticmethod
     def from_spec(spec: str) -> Street:
-        """Create a street from a text such as ``street:crossing?seed=2&sensor=vlp16``."""
+        """Return the street of a text such as ``street:crossing?seed=2&sensor=vlp16``."""
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
         if reader != "street":
@@ -130,7 +134,7 @@ class Street:
             list(pool.map(self.returns, frames))
 
     def picture(self, camera: str, number: int) -> Picture:
-        """Return an image with the exact depth and the simulated body at each pixel."""
+        """Return an image with exact depth and the simulated body of each pixel; InputError without."""
         stamps_ns = self.image_stamps_ns(camera)
         if number not in stamps_ns:
             raise InputError(
@@ -196,7 +200,7 @@ class StreetTruth:
         return self._street.bodies.sweep(frame, returns.body, returns.instance, points)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the (N,3) true scene flow (m) of a sweep's points to the time of ``target``."""
+        """Return the (N,3) true scene flow (m) of a sweep's points to the time of sweep ``target``."""
         self._street.check(target)
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)

@@ -72,7 +72,10 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns of a component by short name; arguments are as in `read_arrow`."""
+        """Return columns (N,) of a component by short name.
+
+        ``kinds`` (by short name) and ``where`` (by full name) are as in `read_arrow`.
+        """
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -208,7 +211,7 @@ def _whole_us(seconds: float) -> int:
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """Open a segment (CONTEXT) of the folder of a split, such as ``training``."""
+    """Return the segment ``scene`` (CONTEXT) of a split's folder; None for the only one."""
     names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
     none = (
         "no segments; expected files such as lidar/10017090168044687777_6380_000_6400_000.parquet"
@@ -257,7 +260,7 @@ class Waymo(FileSequence):
         return _read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the pose T_world_cam (4,4) at the middle of the exposure of image ``number``."""
+        """Return the (4,4) pose T_world_cam at the middle of the exposure of image ``number``."""
         image = self._images[camera][number]
         T_world_vehicle = image.T_world_vehicle
         if len(self.frames) > 1:
