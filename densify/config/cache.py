@@ -63,7 +63,7 @@ class Cache:
         Args:
             step: Name of the step, with which the entry's file name begins.
             inputs: All that the result depends on, of types that `digest` accepts.
-            make: Function that makes the result. One thread or process at a time calls it.
+            make: Function that makes the result. If files can be locked, one process calls it.
         """
         path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
         if (entry := _read(path)) is not None:

@@ -172,7 +172,7 @@ def read_cloud(path: Path) -> StoredCloud:
 
 
 def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write (N,) columns of 4-byte, 8-byte or unsigned numbers as PLY vertices (Turk, 1994)."""
+    """Write (N,) columns of types f4, f8, i4, u1 and u2 by name as PLY vertices (Turk, 1994)."""
     rows = table(columns)
     rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
     kinds = {name: _PLY_TYPES[rows.dtype[name].str.lstrip("<|")] for name in columns}

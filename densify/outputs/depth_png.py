@@ -108,7 +108,7 @@ def metres(stored: NDArray[np.uint16]) -> Float32:
 
 
 def read_depth_png(path: Path) -> Float32:
-    """Return the (H,W) float32 depth in metres of a PNG, 0 for no depth; InputError if no such."""
+    """Return the (H,W) float32 depth in metres of a depth map's PNG, 0 for no depth."""
     return metres(read_stored(path, np.uint16, "a depth map"))
 
 

@@ -49,7 +49,7 @@ def export_run(
     cameras: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> Export:
-    """Write a finished run in another format, from its files alone, and say what it holds.
+    """Write a finished run in another format, from its files alone; return what was written.
 
     Args:
         run: Folder of one key sweep, or of several for formats of whole drives.

@@ -167,7 +167,7 @@ class FileSequence(ABC):
         return self._image(self.check_image(camera, number), number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the recorded (4,4) lidar pose at a sweep's reference time; InputError without."""
+        """Return the recorded (4,4) lidar pose at a sweep's stamp; InputError without poses."""
         self.check_frame(frame)
         return checks.pose(self._pose(frame), f"{self.where}: pose of frame {frame}")
 

@@ -82,7 +82,8 @@ class Stamps:
 def read_stamps(path: Path, required: bool = True) -> Stamps:
     """Return the stamps of a file with a date (UTC) on line k for frame k.
 
-    Other lines give no stamp. A missing file has no stamps; if ``required``, it is an InputError.
+    Other lines give no stamp; InputError if no line has one. A missing file has no stamps, or
+    raises InputError if ``required``.
     """
     if not required and not path.exists():
         return Stamps(path, {})

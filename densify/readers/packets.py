@@ -6,7 +6,7 @@ Velodyne (extra ``velodyne``): the packets do not identify the model reliably; n
 to the accuracy of a packet, stamped when the computer captured its last packet. Incomplete turns at
 the ends are left out. ``offset_ns`` is computed from the packets' clock and the firing order.
 
-Ouster (extra ``ouster``): the ``.json`` metadata of the sensor is named after ``#``, or found by
+Ouster (extra ``ouster``): the ``.json`` metadata of the sensor is named after ``#``, or is found
 beside the capture. A sweep is a frame of the sensor, stamped when the computer captured its first
 packet. The sensor's clock gives the firing times of columns since the first. Rays start on the
 spinning axis, the origin is on the base. Rows follow the range image. Of two returns of a ray the
@@ -111,7 +111,7 @@ class Velodyne(FileSequence):
         super().__init__(path.stem, path, range(len(self._turns)))
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """Return a pair of "packets" and the numbers of packets read, lost and captured twice."""
+        """Return one pair: "packets", and the numbers of packets read, lost and captured twice."""
         return _packet_counts(*self._packet_counts)
 
     def _returns(self, frame: int) -> Returns:
@@ -235,7 +235,7 @@ class Ouster(FileSequence):
         super().__init__(path.stem, path, range(len(index)))
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """Return a pair of "packets" and the numbers of packets read, lost and captured twice."""
+        """Return one pair: "packets", and the numbers of packets read, lost and captured twice."""
         packets = [p for _, p in self._packets if isinstance(p, self._is_lidar_packet)]
         turn = np.array([p.frame_id() for p in packets], np.int64)
         column = [int(p.format.packet_header(self._column, p.buf)[0]) for p in packets]

@@ -130,7 +130,7 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Return each topic's entries by ascending stamp; read no contents of messages.
+        """Return each topic's entries by ascending stamp, without decoding the messages.
 
         A message recorded twice has one entry. This adds to ``num_unstamped`` and ``num_twice``.
         """

@@ -53,7 +53,7 @@ class Street:
         Args:
             preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the
                 ego vehicle stands).
-            seed: Number from 0 that varies the scene.
+            seed: Number from 0 that determines the random values.
             sensor: Name of a lidar in `densify.street.lidar.SENSORS`.
             hz: Sweeps per second: 5, 10 or 20.
             tilt_deg: Pitch of the lidar's mount, nose down. Cameras are not tilted.
@@ -134,7 +134,7 @@ class Street:
             list(pool.map(self.returns, frames))
 
     def picture(self, camera: str, number: int) -> Picture:
-        """Return an image with exact depth and the simulated body of each pixel; InputError without."""
+        """Return an image with the exact depth and the simulated body of each pixel."""
         stamps_ns = self.image_stamps_ns(camera)
         if number not in stamps_ns:
             raise InputError(
@@ -200,7 +200,7 @@ class StreetTruth:
         return self._street.bodies.sweep(frame, returns.body, returns.instance, points)
 
     def displacement(self, frame: int, target: int) -> Float:
-        """Return the (N,3) true scene flow (m) of a sweep's points to the time of sweep ``target``."""
+        """Return the (N,3) true scene flow (m) of a sweep's points to the time of ``target``."""
         self._street.check(target)
         returns = self._street.returns(frame)
         points = self._street.simulator.in_bodies(frame, returns)
