@@ -264,8 +264,8 @@ def apply_overrides(
 ) -> None:
     """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``.
 
-    ``sections`` has the class of each section. InputError for a text of another form, an unknown
-    key, or a value that does not fit.
+    ``sections`` has the class of each section. Raise InputError for a text of another form, an
+    unknown key, or a value that does not fit.
     """
     for override in overrides:
         where = f"--set {override}"

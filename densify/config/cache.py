@@ -214,8 +214,8 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 def own_folder(name: str) -> Path:
     """Return the folder ``name`` in the user's cache folder, made if it does not exist.
 
-    The cache folder is DENSIFY_CACHE_DIR, or else the system's usual one. InputError if other users
-    can write to either folder. A folder that cannot be made is no error here.
+    The cache folder is DENSIFY_CACHE_DIR, or else the system's usual one. Raise InputError if other
+    users can write to either folder. A folder that cannot be made is no error here.
     """
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))

@@ -53,7 +53,7 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
 
 
 def gunzip(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return decompressed gzip data; InputError if damaged, empty or too large unpacked."""
+    """Return decompressed gzip data; raise InputError if damaged, empty or too large unpacked."""
     try:
         with gzip.open(io.BytesIO(data)) as file:
             content = file.read(most_bytes + 1)
@@ -118,8 +118,8 @@ def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
     """Return the content of YAML text, None if empty, and the line number of each dotted key.
 
-    A key ``b`` in a mapping ``a`` is ``a.b``. InputError, which begins with ``where``, for invalid
-    text, a key that is given twice, or more than 30 aliases.
+    A key ``b`` in a mapping ``a`` is ``a.b``. Raise InputError, whose message begins with
+    ``where``, for invalid text, a key that is given twice, or more than 30 aliases.
     """
     import yaml
 

@@ -136,8 +136,8 @@ ENGINES = Table(
 def check_engine_spec(spec: str) -> tuple[str, str]:
     """Return the name and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``.
 
-    No module is imported. InputError if no engine has this name, or if a built-in engine has an
-    argument too many or lacks its argument.
+    No module is imported. Raise InputError if no engine has this name, or if a built-in engine has
+    an argument too many or lacks its argument.
     """
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")

@@ -113,8 +113,8 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     """Write a cloud as LAZ with positions rounded to 1 mm; ``stamp_ns`` is the key sweep's time.
 
     ``gps_time`` is as in LAS 1.4: seconds since 1980-01-06 minus 10^9, without leap seconds. The
-    header has the day of ``stamp_ns``. Equal clouds give equal bytes. ValueError for points that
-    are not finite or beyond 2,147 km.
+    header has the day of ``stamp_ns``. Equal clouds give equal bytes. Raise ValueError for points
+    that are not finite or beyond 2,147 km.
     """
     import laspy
 

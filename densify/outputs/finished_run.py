@@ -99,7 +99,7 @@ class LoadedResult:
 def load_result(folder: str | Path) -> LoadedResult:
     """Return the arrays of a finished run from its folder, such as densify-out/street/000120.
 
-    InputError if a file of the run is missing or damaged.
+    Raise InputError if a file of the run is missing or damaged.
     """
     run = FinishedRun(Path(folder))
     with _damage_named(run.folder / "metrics.json"):

@@ -44,7 +44,7 @@ def flow_writer(
     """Yield a function that writes the flow of one sweep, a `FlowWriter`.
 
     ``form`` is npz, av2, opensceneflow, semantickitti or doc-depth. ``frames``, of the sweeps to
-    write, ascend. InputError if files exist in ``out``, unless ``overwrite`` replaces them.
+    write, ascend. Raise InputError if files exist in ``out``, unless ``overwrite`` replaces them.
     """
     paths = {frame: _path_of(form, sequence, out, frame) for frame in frames}
     if form == "av2":

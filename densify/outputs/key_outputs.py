@@ -54,8 +54,8 @@ def write_result(
     """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
 
     run.yaml records ``config``, the settings ``{section: {key: value}}``, and ``data``, the text of
-    ``--data``. InputError if the files exist, unless ``overwrite`` replaces them, or if ``out`` has
-    results of another recording.
+    ``--data``. Raise InputError if the files exist, unless ``overwrite`` replaces them, or if
+    ``out`` has results of another recording.
     """
     check_recording(out, result.recording, data, [result.key])
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:

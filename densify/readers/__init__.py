@@ -163,7 +163,7 @@ def align(lines: Sequence[tuple[str, str]]) -> str:
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Return a recording's summary as (name, text) pairs; InputError if no sweep is readable.
+    """Return a recording's summary as (name, text) pairs; raise InputError if no sweep is readable.
 
     The pairs give frames, rate, stamps, points, cameras, poses, truth and the reader's findings.
     Points and stamps are those of the first and the last readable sweep.

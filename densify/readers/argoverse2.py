@@ -82,10 +82,10 @@ class Argoverse2(FileSequence):
             log,
             range(len(sweeps)),
             cameras,
-            {name: dict(enumerate(files)) for name, files in images.items()},
-            checks.truth_beside(log),
-            dict(enumerate(sweeps.values())),
-            {name: dict(enumerate(files.values())) for name, files in images.items()},
+            exposed_ns={name: dict(enumerate(files)) for name, files in images.items()},
+            truth=checks.truth_beside(log),
+            files=dict(enumerate(sweeps.values())),
+            images={name: dict(enumerate(files.values())) for name, files in images.items()},
         )
 
     def _returns(self, frame: int) -> Returns:
@@ -97,9 +97,9 @@ class Argoverse2(FileSequence):
             self._track.undo_compensation(points, self._stamps_ns[frame], offset_ns),
             (columns["intensity"] / 255.0).astype(np.float32),
             offset_ns,
-            columns["laser_number"].astype(np.int64) // LASERS_PER_SCANNER,
-            self._T_ego_scanner[:, :3, 3],
-            checks.scanner_axes(self._T_ego_scanner),
+            lidar=columns["laser_number"].astype(np.int64) // LASERS_PER_SCANNER,
+            scanner_origins=self._T_ego_scanner[:, :3, 3],
+            R_scanner_lidar=checks.scanner_axes(self._T_ego_scanner),
         )
 
     def _pose(self, frame: int) -> Float:

@@ -86,7 +86,7 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
 
 
 def decode_rgb(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
-    """Return an image file's bytes as (H,W,3) uint8 RGB; InputError if of another size."""
+    """Return an image file's bytes as (H,W,3) uint8 RGB; raise InputError if of another size."""
     bgr = decode_image(data, where)
     check_image_size(bgr.shape, camera, where)
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
@@ -112,7 +112,8 @@ def pinhole(
 ) -> Camera:
     """Return a camera with zero skew; ``lens`` has further arguments of `Camera`.
 
-    InputError, which begins with ``where``, unless the focal lengths and sizes are above 0.
+    Raise InputError, whose message begins with ``where``, unless the focal lengths and sizes are
+    above 0.
     """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
@@ -169,8 +170,8 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
 def pose(T: Any, where: str) -> Float:
     """Return a (4,4) rigid transform from (4,4), (3,4), or 16 or 12 numbers, row by row.
 
-    InputError, which begins with ``where``, if a number is not finite, or the rotation is mirrored
-    or not orthonormal to 0.001.
+    Raise InputError, whose message begins with ``where``, if a number is not finite, or the
+    rotation is mirrored or not orthonormal to 0.001.
     """
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T
@@ -200,8 +201,8 @@ def quaternion_pose(
 ) -> Float:
     """Return the (4,4) pose of a unit quaternion, scalar first, and a translation in metres.
 
-    InputError, which begins with ``where``, for other than 4 and 3 finite numbers, or a quaternion
-    whose length is more than 0.01 from 1.
+    Raise InputError, whose message begins with ``where``, for other than 4 and 3 finite numbers, or
+    a quaternion whose length is more than 0.01 from 1.
     """
     from scipy.spatial.transform import Rotation
 

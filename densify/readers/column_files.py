@@ -156,8 +156,8 @@ class _Unpickler(pickle._Unpickler):
 def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns (N,) of a gzipped, pickled pandas data frame, by name; no code is run.
 
-    A column of texts holds Python objects, whose type the caller must check. InputError if the file
-    is no such data frame.
+    A column of texts holds Python objects, whose type the caller must check. Raise InputError if
+    the file is no such data frame.
     """
     data = read_bytes(path)
     try:

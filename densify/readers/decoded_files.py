@@ -56,7 +56,7 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return arrays of a .npz by name, all for None; InputError if over ``most_bytes``."""
+    """Return arrays of a .npz by name, all for None; raise InputError if over ``most_bytes``."""
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -102,8 +102,8 @@ def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
     """Return the (H,W,3) uint8 pixels of PNG or JPEG bytes as blue, green, red.
 
-    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16. InputError, which
-    begins with ``where``, for damaged bytes.
+    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16. Raise InputError,
+    whose message begins with ``where``, for damaged bytes.
     """
     import cv2
     from PIL import Image
@@ -140,7 +140,7 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return the width and height (px) of an image file; InputError if it is damaged."""
+    """Return the width and height (px) of an image file; raise InputError if it is damaged."""
     height, width = read_image(path).shape[:2]
     return width, height
 

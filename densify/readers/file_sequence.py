@@ -107,7 +107,7 @@ class FileSequence(ABC):
         return checks.decode_rgb(read_bytes(path), camera, path)
 
     def _pose(self, frame: int) -> Float:
-        """Return the (4,4) T_world_lidar of an existing sweep; InputError without poses."""
+        """Return the (4,4) T_world_lidar of an existing sweep; raise InputError without poses."""
         raise InputError(
             f"{self.where}: no poses; let the sweeps register themselves with "
             f"--set register.source=kiss-icp"
@@ -117,7 +117,7 @@ class FileSequence(ABC):
         """Return the valid points of a sweep, in file order, at their own firing times.
 
         Rows at 0 0 0 (padding) or not finite are dropped; intensities that are not finite become 0.
-        InputError if the sweep is missing, malformed or without valid points.
+        Raise InputError if the sweep is missing, malformed or without valid points.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower

@@ -65,7 +65,7 @@ def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowF
     """Return the flow of a sweep to another, ego-motion removed, lidar frame.
 
     ``source`` and ``target`` are indices in ``stretch``. A point that the file lacks is static.
-    InputError if the file is missing or malformed.
+    Raise InputError if the file is missing or malformed.
     """
     columns = _step_columns(folder, stretch, stretch.frames[source], stretch.frames[target])
     residual = columns["residual_flow"]

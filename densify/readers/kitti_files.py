@@ -30,7 +30,7 @@ _HALF_VIEW_DEG = 90.0  # of a fisheye
 def read_points(path: Path) -> tuple[Float, np.ndarray]:
     """Return a sweep file's (N,3) points (m, lidar frame) and (N,) reflectances (0 to 1).
 
-    A point that is not finite becomes 0 0 0. InputError if the file is cut off.
+    A point that is not finite becomes 0 0 0. Raise InputError if the file is cut off.
     """
     data = read_bytes(path)
     if len(data) % 16:

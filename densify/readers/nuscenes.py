@@ -239,9 +239,9 @@ def _channels(tables: Path, records: Sequence[Record]) -> dict[str, Channels]:
         channel[len(channel)] = Datum(
             stamp_ns(record),
             checks.file_within(tables.parent, record["filename"], table),
-            T[token],
-            (int(record.get("width") or 0), int(record.get("height") or 0)),
-            calibrated[token].get("camera_intrinsic"),
+            T_ego_sensor=T[token],
+            size_px=(int(record.get("width") or 0), int(record.get("height") or 0)),
+            intrinsics=calibrated[token].get("camera_intrinsic"),
         )
     return channels
 
@@ -274,14 +274,14 @@ class NuScenes(FileSequence):
             name,
             root,
             list(sweeps),
-            {channel: self._camera(channel, data[0]) for channel, data in self._images.items()},
-            {
+            cameras={c: self._camera(c, data[0]) for c, data in self._images.items()},
+            exposed_ns={
                 channel: {number: self._images[channel][number].stamp_ns for number in files}
                 for channel, files in images.items()
             },
-            checks.truth_beside(root),
-            sweeps,
-            images,
+            truth=checks.truth_beside(root),
+            files=sweeps,
+            images=images,
         )
 
     def _camera(self, name: str, image: Datum) -> Camera:

@@ -97,9 +97,9 @@ class PandaSet(FileSequence):
             tuple(sorted(sweeps)),
             cameras,
             exposed_ns,
-            checks.truth_beside(path),
-            sweeps,
-            images,
+            truth=checks.truth_beside(path),
+            files=sweeps,
+            images=images,
         )
 
     def T_world_cam(self, camera: str, number: int) -> Float:
@@ -126,8 +126,8 @@ class PandaSet(FileSequence):
             self._track.undo_compensation(points, stamp_ns, offset_ns),
             (brightness / 255).astype(np.float32),
             offset_ns,
-            np.clip(scanner, 0, 1).astype(np.uint8),
-            np.stack([np.zeros(3), PANDAR_GT_M]),
+            lidar=np.clip(scanner, 0, 1).astype(np.uint8),
+            scanner_origins=np.stack([np.zeros(3), PANDAR_GT_M]),
         )
 
     def _pose(self, frame: int) -> Float:

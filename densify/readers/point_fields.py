@@ -304,7 +304,7 @@ class PointLayout:
         """Return all N rows of a sweep, and a mask (N,) of the valid rows.
 
         Valid rows have a finite position, not 0 0 0, and a time inside the sweep; others get 0 0 0.
-        InputError, which begins with ``where``, if a column is missing.
+        Raise InputError, whose message begins with ``where``, if a column is missing.
         """
         missing = [name for name in vars(self.fields).values() if name and name not in columns]
         if missing:

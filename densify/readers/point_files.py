@@ -54,11 +54,11 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Return all rows of a point file, in file order; InputError if damaged or without rows.
+    """Return all rows of a point file, in file order; raise InputError if damaged or without rows.
 
-    ``names`` are the names of the columns in .bin, .csv, .txt and unstructured arrays. None takes the
-    names of the first line, or x, y, z, intensity, column4, column5 and so on.
-    
+    ``names`` are the names of the columns in .bin, .csv, .txt and unstructured arrays. None takes
+    the names of the first line, or x, y, z, intensity, column4, column5 and so on.
+
     .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
                 values fit one of them
     .npy, .npz  an (N,3 or more) array, in an .npz called ``points``; or organised (H,W,3 or more);

@@ -45,7 +45,7 @@ class PriorFiles:
     def open(path: Path, cameras: Sequence[str]) -> PriorFiles:
         """Return the prior files of the cameras in a folder, or of one camera in a file or folder.
 
-        InputError if nothing is found, or if files of one camera have to serve several.
+        Raise InputError if nothing is found, or if files of one camera have to serve several.
         """
         where = f"prior {path}"
         example = "0000000120.npy, .exr or .png"
@@ -77,7 +77,7 @@ class PriorFiles:
     def prior(self, camera: Camera, number: int) -> Prior | None:
         """Return an image's prior at the camera's size (H,W); None if it has no prior.
 
-        A prior of another size is resized if its aspect ratio agrees to 2 %; else InputError.
+        A prior of another size is resized if its aspect ratio agrees to 2 %; else raise InputError.
         """
         path = self.values[camera.name].get(number)
         if path is None:

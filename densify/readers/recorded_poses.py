@@ -203,7 +203,7 @@ class PoseFile:
         """Return frame number -> (4,4) pose; ``frames`` are the recording's, ascending.
 
         Poses of files for each sweep keep their frames. As many poses as ``frames`` are in their
-        order. More poses than the last frame number belong to the numbers from 0. Otherwise
+        order. More poses than the last frame number belong to the numbers from 0. Otherwise raise
         InputError.
         """
         if self.frames is not None:

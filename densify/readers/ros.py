@@ -347,10 +347,10 @@ class RosBag(FileSequence):
             np.concatenate([cloud.points for cloud in clouds]),
             np.concatenate(intensities),
             np.concatenate(offsets_ns) if len(offsets_ns) == len(clouds) else None,
-            np.concatenate(
+            lidar=np.concatenate(
                 [np.full(len(cloud.points), number, np.uint8) for number, cloud in numbered_clouds]
             ),
-            origins if len(self._lidars) > 1 else None,
+            scanner_origins=origins if len(self._lidars) > 1 else None,
             num_untimed=sum(cloud.num_untimed for cloud in clouds),
         )
 

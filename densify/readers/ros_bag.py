@@ -100,7 +100,7 @@ class Recorded(NamedTuple):
 
 
 class Bag:
-    """A ROS 1 or ROS 2 bag, opened for reading; InputError if it is missing or damaged."""
+    """A ROS 1 or ROS 2 bag, opened for reading; raises InputError if it is missing or damaged."""
 
     def __init__(self, path: Path) -> None:
         # A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files that are

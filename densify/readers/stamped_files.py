@@ -174,8 +174,8 @@ class StampFile(NamedTuple):
         """Return the stamps (ns) of files by their numbers.
 
         Lines with names belong to the files of these names. As many lines as files are in the
-        files' order. Otherwise line k, from 0, is of the number k. InputError if a file has no
-        line.
+        files' order. Otherwise line k, from 0, is of the number k. Raise InputError if a file has
+        no line.
         """
         if self.names is not None:
             by_name = {Path(n).stem: ns for n, ns in zip(self.names, self.stamp_ns, strict=True)}

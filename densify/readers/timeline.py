@@ -153,7 +153,7 @@ class Timeline:
         """Return the key frame and up to ``window`` sweeps before and after the key frame.
 
         A side ends early at the recording's end, at a hole in time, or before a left out sweep.
-        InputError if the key frame does not exist or ``window`` is no number of sweeps.
+        Raise InputError if the key frame does not exist or ``window`` is no number of sweeps.
 
         Args:
             key: Frame number of the key sweep.
@@ -240,7 +240,7 @@ def remove_unusable_returns(sweep: Sweep, settings: RegisterSettings) -> Sweep:
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """Return the cameras of these names in this order; InputError for an unknown name.
+    """Return the cameras of these names in this order; raise InputError for an unknown name.
 
     For None, return the cameras with images, or all cameras if none has images.
     """

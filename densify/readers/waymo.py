@@ -161,10 +161,12 @@ def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]
             pose_s, shutter_s, trigger_s, done_s = map(float, times_s)
             name = dict(enumerate(CAMERAS, 1))[int(camera)]
             images_of_camera[name][frame] = Image(
-                _whole_us(pose_s),
-                _whole_us((trigger_s + done_s) / 2),
-                max(done_s - trigger_s - shutter_s, 0.0),
-                checks.pose(T, f"{segment.file('camera_image')}: {name}, frame {frame}"),
+                pose_ns=_whole_us(pose_s),
+                exposed_ns=_whole_us((trigger_s + done_s) / 2),
+                readout_s=max(done_s - trigger_s - shutter_s, 0.0),
+                T_world_vehicle=checks.pose(
+                    T, f"{segment.file('camera_image')}: {name}, frame {frame}"
+                ),
             )
     return {name: images for name, images in images_of_camera.items() if images}
 
@@ -286,9 +288,9 @@ class Waymo(FileSequence):
             np.concatenate(points),
             np.concatenate(intensity).astype(np.float32),
             np.concatenate(offset_ns),
-            np.concatenate(lidar),
-            T[:, :3, 3],
-            checks.scanner_axes(T),
+            lidar=np.concatenate(lidar),
+            scanner_origins=T[:, :3, 3],
+            R_scanner_lidar=checks.scanner_axes(T),
         )
 
     def _range_images(self, frame: int) -> Iterator[tuple[int, Float]]:
