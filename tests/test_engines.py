@@ -29,7 +29,7 @@ def driving() -> Scene:
 
 @pytest.mark.parametrize("row", ENGINES.built_in, ids=lambda row: row.name)
 def test_every_engine_has_the_one_interface(row) -> None:
-    module = row.work()
+    module = row.load_module()
     assert list(inspect.signature(module.estimate_motion).parameters) == [
         "scene",
         "settings",

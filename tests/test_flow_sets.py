@@ -17,7 +17,7 @@ from densify.config import resolve
 from densify.config.errors import InputError
 from densify.geometry.types import Stretch
 from densify.readers import open_sequence
-from densify.readers.flow_files import labelled_flow
+from densify.readers.flow_files import read_labelled_flow
 from densify.readers.street import Street
 from tests.command import files_in
 from tests.exact_motion import registered
@@ -225,13 +225,13 @@ def test_labels_by_number_and_what_is_wrong_with_them(log, tmp_path):
         (labels, log.name, "holds 3 labels"),
     ):
         with pytest.raises(InputError, match=words):
-            labelled_flow(folder, name, stretch, 0)
+            read_labelled_flow(folder, name, stretch, 0)
     np.savez(empty / "000005_000006.npz", residual_flow=np.zeros((9, 3)))
     with pytest.raises(InputError, match="no such flow file"):
-        labelled_flow(empty, "x", stretch, 0)
+        read_labelled_flow(empty, "x", stretch, 0)
     number = np.arange(30)
     columns = {"object": number - 1, "valid": number % 2 == 0}
     np.savez(empty / "000000_000001.npz", residual_flow=np.ones((30, 3)), **columns)
-    label, row = labelled_flow(empty, "x", stretch, 0), stretch.sweeps[0].sweep.row
+    label, row = read_labelled_flow(empty, "x", stretch, 0), stretch.sweeps[0].sweep.row
     np.testing.assert_array_equal(label.valid, row % 2 == 0)
     np.testing.assert_array_equal(label.classes > 0, row > 0)

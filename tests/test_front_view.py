@@ -13,7 +13,7 @@ import pytest
 from densify.cli.runs import _front_first
 from densify.geometry.types import CameraView
 from densify.outputs import plots
-from densify.outputs.plots import front_first
+from densify.outputs.plots import order_front_first
 from densify.outputs.report_page import KeyFiles, key_page
 from tests.exported import camera_of, write_views
 
@@ -45,7 +45,7 @@ def travel(x_m: float, y_m: float) -> dict[int, np.ndarray]:
     ],
 )
 def test_travel_decides_or_at_rest_the_name(names, poses, expected) -> None:
-    assert front_first(names, VIEWS, poses) == expected
+    assert order_front_first(names, VIEWS, poses) == expected
 
 
 def test_figure_page_and_screen_begin_with_it(tmp_path: Path, monkeypatch) -> None:

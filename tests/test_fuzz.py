@@ -27,7 +27,7 @@ from writers import FORMATS
 from densify.cli.recordings import read_points
 from densify.config import resolve
 from densify.config.errors import ComputationError, InputError
-from densify.config.file_content import gunzipped, read_bytes, read_json
+from densify.config.file_content import gunzip, read_bytes, read_json
 from densify.dataset.plan import read_plan
 from densify.geometry.types import Camera
 from densify.outputs.cloud_files import read_cloud
@@ -220,7 +220,7 @@ FILES: dict[str, tuple[tuple[Callable[[Path], Any], ...], bytes]] = {
     "kitti.txt": ((PoseFile.read,), KITTI_POSES.encode()),
     "tum.txt": ((PoseFile.read,), TUM_POSES.encode()),
     "labels.txt": ((read_labels,), LABEL.encode() * 3),
-    "a.gz": ((lambda path: gunzipped(read_bytes(path), path),), gzip.compress(b"a" * 99)),
+    "a.gz": ((lambda path: gunzip(read_bytes(path), path),), gzip.compress(b"a" * 99)),
     "dataset.json": (
         (lambda path: read_plan(path.parent),),
         b'{"schema_version": 1, "drives": {}}',

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.readers.point_fields import TimeField, find_fields, find_times, full_scale, scaled
+from densify.readers.point_fields import TimeField, find_fields, find_times, full_scale, rescale
 
 STAMP_NS = 1_317_042_661_099_997_611
 PERIOD_NS = 100_000_000
@@ -110,6 +110,6 @@ def test_intensities_are_brought_to_one() -> None:
     for values, scale in (([0, 0.4, 1], 1), ([0, 7, 200], 255), ([0, 256], 65535), ([1e6], 1e6)):
         intensity = np.array(values, np.float32)
         assert full_scale(intensity) == scale
-        assert scaled(intensity, scale).max() <= 1
-    clipped = scaled(np.array([np.nan, 300, 51.0]), 255)
+        assert rescale(intensity, scale).max() <= 1
+    clipped = rescale(np.array([np.nan, 300, 51.0]), 255)
     np.testing.assert_array_equal(clipped, [0, 1, np.float32(0.2)])

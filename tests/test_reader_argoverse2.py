@@ -82,7 +82,7 @@ def test_real_rings_are_sharp_as_fired(test_data):
     table = feather.read_table(path)
     laser = table["laser_number"].to_numpy()
     stored = np.stack([table[axis].to_numpy().astype(float) for axis in "xyz"], axis=1)
-    back = sequence._track.compensated(sweep.points, sweep.stamp_ns, sweep.offset_ns)
+    back = sequence._track.compensate(sweep.points, sweep.stamp_ns, sweep.offset_ns)
     np.testing.assert_allclose(back, stored, atol=1e-9)
     T_scanner_ego = inverse(sequence._T_ego_sensor["up_lidar"])
 

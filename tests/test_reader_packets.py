@@ -13,7 +13,7 @@ import pytest
 from densify.config.errors import InputError
 from densify.free_space.rays import find_rings
 from densify.readers import open_sequence
-from densify.readers.packets import MODELS, Ouster, Velodyne, lost_and_doubled
+from densify.readers.packets import MODELS, Ouster, Velodyne, count_lost_and_repeated
 from tests.reader_checks import check_refused
 
 HEADERS = bytes(42)  # Ethernet, IP, UDP: not looked at
@@ -229,7 +229,7 @@ def test_packets_of_an_ouster_are_counted_over_turns() -> None:
     turn, column = (a.ravel() for a in np.mgrid[65_534:65_538, 256:768:16])
     late = np.arange(len(turn))
     late[[31, 32]] = 32, 31
-    assert lost_and_doubled(turn[late] % 65_536, column[late]) == (0, 0)
+    assert count_lost_and_repeated(turn[late] % 65_536, column[late]) == (0, 0)
     kept = np.setdiff1d(np.arange(len(turn)), [5, 40, 41])
     again = np.concatenate([kept[:50], kept[49:]])
-    assert lost_and_doubled(turn[again] % 65_536, column[again]) == (3, 1)
+    assert count_lost_and_repeated(turn[again] % 65_536, column[again]) == (3, 1)

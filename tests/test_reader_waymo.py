@@ -120,7 +120,7 @@ def test_compensated_they_are_the_points_of_the_published_conversion(written):
     sweep = sequence[1]
     kept = sweep.select(sweep.row % image.shape[1] % POSED_COLUMNS == 0)
     assert len(kept) == len(expected) > 200
-    compensated = sequence._track.compensated(kept.points, kept.stamp_ns, kept.offset_ns)
+    compensated = sequence._track.compensate(kept.points, kept.stamp_ns, kept.offset_ns)
     np.testing.assert_allclose(compensated, expected, atol=0.01)
 
 

@@ -38,16 +38,20 @@ def test_points_at_their_own_times_follow_the_path(track):
         ]
     )
     at_stamp = transform(inverse(pose(stamp_ns)), world)
-    np.testing.assert_allclose(track.as_fired(at_stamp, stamp_ns, offset_ns), fired, atol=2e-4)
-    np.testing.assert_allclose(track.compensated(fired, stamp_ns, offset_ns), at_stamp, atol=2e-4)
-    back = track.compensated(track.as_fired(world, stamp_ns, offset_ns), stamp_ns, offset_ns)
+    np.testing.assert_allclose(
+        track.undo_compensation(at_stamp, stamp_ns, offset_ns), fired, atol=2e-4
+    )
+    np.testing.assert_allclose(track.compensate(fired, stamp_ns, offset_ns), at_stamp, atol=2e-4)
+    back = track.compensate(
+        track.undo_compensation(world, stamp_ns, offset_ns), stamp_ns, offset_ns
+    )
     np.testing.assert_allclose(back, world, atol=1e-9)
     assert np.linalg.norm(at_stamp - fired, axis=1).max() > 0.7
 
 
 def test_rows_that_formats_pad_with_stay_zeros(track):
     points = np.array([[0.0, 0, 0], [5, 0, 0]])
-    fired = track.as_fired(points, 5_200_000_000, np.array([40_000_000, 40_000_000]))
+    fired = track.undo_compensation(points, 5_200_000_000, np.array([40_000_000, 40_000_000]))
     assert not fired[0].any() and fired[1, 0] != 5
 
 

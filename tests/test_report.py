@@ -27,7 +27,7 @@ from densify.outputs.cloud_files import read_cloud, write_cloud
 from densify.outputs.depth_png import encode_png, read_stored
 from densify.outputs.export import export_run
 from densify.outputs.key_outputs import write_comparison, write_result
-from densify.outputs.report_page import Blobs, packed_cloud, page_file, thinned
+from densify.outputs.report_page import Blobs, pack_cloud, page_file, thin_cloud
 from densify.pipeline.run import compare
 from densify.readers.decoded_files import decode_image
 from tests.command import refused
@@ -100,11 +100,11 @@ def test_arrays_come_back() -> None:
 def test_thinning_keeps_moving_and_distant_points() -> None:
     rng = np.random.default_rng(1)
     points, moving = rng.normal(0, [30, 30, 2], (40_000, 3)), np.arange(40_000) < 500
-    assert len(thinned(points, moving, 40_000)) == 40_000
-    rows = thinned(points, moving, 5000)
+    assert len(thin_cloud(points, moving, 40_000)) == 40_000
+    rows = thin_cloud(points, moving, 5000)
     assert len(rows) == 5000 and (np.diff(rows) > 0).all()
     assert moving[rows].sum() > 400
-    assert np.array_equal(rows, thinned(points, moving, 5000))
+    assert np.array_equal(rows, thin_cloud(points, moving, 5000))
     left = np.linalg.norm(points[rows], axis=1) > 40
     all_far = np.linalg.norm(points, axis=1) > 40
     assert left.mean() > 1.5 * all_far.mean()
@@ -114,7 +114,7 @@ def test_points_come_back_to_half_a_step(tmp_path: Path) -> None:
     write_cloud(tmp_path / "cloud.laz", cloud_of(3000))
     cloud, blobs = read_cloud(tmp_path / "cloud.laz"), Blobs()
     num_moving = int(cloud.moving.sum())
-    entry = packed_cloud(blobs, cloud, [119, 120, 121], [2, 0])
+    entry = pack_cloud(blobs, cloud, [119, 120, 121], [2, 0])
     assert (entry["num_points"], entry["num_all"]) == (3000, 3000)
     assert entry["num_moving"] == num_moving and entry["step_m"] < 0.0035
     places = np.stack([unpacked(blobs, e) for e in entry["places"]], axis=1)

@@ -37,7 +37,7 @@ def test_a_hole_in_time_ends_a_window_and_is_named():
     assert found.cuts == ("0.4 s lie between frames 6 and 10",)
     assert there.window(6, 3) == ((3, 4, 5, 6), found.cuts)
     assert there.before(12, 5) == [10, 11] and there.after(4, 5) == [5, 6]
-    assert there.runs([4, 5, 6, 10, 11, 13]) == [[4, 5, 6], [10, 11], [13]]
+    assert there.split_at_holes([4, 5, 6, 10, 11, 13]) == [[4, 5, 6], [10, 11], [13]]
 
 
 def test_a_sweep_that_is_left_out_ends_a_window_with_its_reason():

@@ -37,7 +37,7 @@ from densify.outputs.atomic import plain
 from densify.pipeline.accumulate import accumulate
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
-from densify.readers.flow_files import LabelledFlow, labelled_flow
+from densify.readers.flow_files import LabelledFlow, read_labelled_flow
 from densify.scores.cloud_scores import ghost_rate
 from densify.scores.flow_metrics import (
     CLASSES,
@@ -181,7 +181,7 @@ class Scorer:
         if sequence.truth is not None:
             truths = {f: SweepTruth.of(sequence.truth, stretch, f, key) for f in frames}
         if folder is not None:
-            labels = {f: labelled_flow(folder, sequence.name, stretch, f) for f in sources}
+            labels = {f: read_labelled_flow(folder, sequence.name, stretch, f) for f in sources}
         elif truths is not None:
             labels = {f: truths[f].as_label() for f in sources}
         return Scorer(stretch, key, recording.searched(key), above, sources, truths, labels)

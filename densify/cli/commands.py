@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from densify.cli.options import add_options
 from densify.config import presets
-from densify.config.errors import brief, did_you_mean
+from densify.config.errors import did_you_mean, shorten_message
 from densify.config.plugins import ENGINES, EXPORTS, READERS
 from densify.version import __version__
 
@@ -452,4 +452,4 @@ class _Parser(argparse.ArgumentParser):
             print(message, end="", file=file or sys.stderr)
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"densify: {brief(message)}; see {self.prog} --help\n")
+        self.exit(2, f"densify: {shorten_message(message)}; see {self.prog} --help\n")

@@ -24,7 +24,7 @@ from densify.cli.options import (
     selected_frames,
 )
 from densify.cli.screen import Answer, first_of, log_warnings, percent, progress_on_stderr
-from densify.config import Config, apply_overrides, changed, resolve
+from densify.config import Config, apply_overrides, find_changes, resolve
 from densify.config.errors import ComputationError, InputError
 from densify.dataset.make import Summary, damaged, make_dataset, status
 from densify.dataset.plan import Gate, Recipe, plan
@@ -38,7 +38,7 @@ from densify.outputs.flow_writers import flow_npz, flow_writer
 from densify.outputs.recording_folder import check_recording, default_folder
 from densify.outputs.simulated_street import write_street
 from densify.pipeline.run import flow_steps
-from densify.readers import describe, findings, in_lines, open_sequence
+from densify.readers import align, describe, findings, open_sequence
 from densify.readers.point_files import read_table
 from densify.readers.street import Street
 
@@ -60,7 +60,7 @@ def answer_info(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify info``: yield what a recording holds."""
     sequence = open_sequence(recording_of(options))
     lines, frames, cameras = findings(sequence), [*sequence.frames], [*sequence.cameras]
-    yield Answer(in_lines(lines), {"recording": dict(lines), "frames": frames, "cameras": cameras})
+    yield Answer(align(lines), {"recording": dict(lines), "frames": frames, "cameras": cameras})
 
 
 def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
@@ -78,7 +78,7 @@ def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     files = []
     if options.write is not None:
         changes = [text for f in diagnosis.findings for text in _SETTING.findall(f.remedy)]
-        settings = changed(resolve(config, changes))
+        settings = find_changes(resolve(config, changes))
         write_file(options.write, yaml.safe_dump(settings, sort_keys=False).encode())
         files = [options.write]
     yield Answer(f"{describe(sequence)}\n\n{_verdicts(diagnosis)}", facts, files)

@@ -31,7 +31,7 @@ from densify.outputs.atomic import plain
 from densify.outputs.export import Export, export_run, facts
 from densify.outputs.finished_run import Thresholds, finished_runs
 from densify.outputs.key_outputs import check_writable, write_comparison, write_result
-from densify.outputs.plots import front_first
+from densify.outputs.plots import order_front_first
 from densify.outputs.recording_folder import check_recording, default_folder
 from densify.outputs.viewers import show_in_open3d, show_in_rerun
 from densify.pipeline import run as pipeline
@@ -131,7 +131,7 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
 
 def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
     """Return the files of a run, those of the camera that looks ahead first."""
-    names = front_first([*result.depth], result.views, result.T_key_lidar)
+    names = order_front_first([*result.depth], result.views, result.T_key_lidar)
     front = [
         path for path in paths if names and path.with_suffix("").as_posix().endswith(f"/{names[0]}")
     ]

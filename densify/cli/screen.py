@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from densify.config.errors import brief
+from densify.config.errors import shorten_message
 
 if TYPE_CHECKING:
     from densify.geometry.types import Progress
@@ -153,7 +153,7 @@ class Screen(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a line, and keep it if it is a warning."""
-        text = brief(" ".join(record.getMessage().split()))
+        text = shorten_message(" ".join(record.getMessage().split()))
         is_warning = record.levelno == logging.WARNING
         if is_warning:
             self._warnings.append(text)

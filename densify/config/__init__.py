@@ -22,33 +22,28 @@ _FEW_POINTS_PER_S = 800_000  # 64 rings have 1.2 million, 32 have 700,000
 _AROUND_FEW_S, _AROUND_S = 0.5, 0.3
 
 
-def within(default: float | None, low: float, high: float) -> Any:
-    """Return a dataclass field for a number with inclusive bounds."""
+def number_field(default: float | None, low: float, high: float) -> Any:
+    """Return a dataclass field for a number from ``low`` to ``high``, both included."""
     return field(default=default, metadata={"limits": (low, high)})
 
 
-def one_of(*words: str) -> Any:
-    """Return a dataclass field for a choice among words; the default is the first word."""
+def choice_field(*words: str) -> Any:
+    """Return a dataclass field for one of the texts ``words``; the first one is the default."""
     return field(default=words[0], metadata={"words": words})
 
 
 @dataclass(frozen=True)
 class Section:
-    """The settings of one stage, checked on construction."""
+    """The settings of one stage; construction raises InputError for a value that does not fit."""
 
     def __post_init__(self) -> None:
         for knob in fields(self):
-            value = checked(type(self), knob.name, getattr(self, knob.name), "")
+            value = _convert_value(type(self), knob.name, getattr(self, knob.name), "")
             object.__setattr__(self, knob.name, value)
 
 
-def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
-    """Return a user's value converted to the type of its setting.
-
-    Args:
-        section: Class with the setting.
-        value: Value as parsed from YAML.
-    """
+def _convert_value(section: type[Section], key: str, value: Any, where: str) -> Any:
+    """Return a user's value converted to the type of its setting, or raise InputError."""
     knob = section.__dataclass_fields__[key]
     kind, _, optional = str(knob.type).partition(" | ")
     if optional and value is None:
@@ -77,10 +72,10 @@ def checked(section: type[Section], key: str, value: Any, where: str) -> Any:
 class RegisterSettings(Section):
     """Settings for the pose of the lidar at every sweep."""
 
-    source: str = one_of("kiss-icp", "dataset")
-    voxel_size_m: float = within(0.5, 0.05, 10)
-    min_range_m: float = within(2.8, 0, 50)
-    max_range_m: float = within(120.0, 5, 500)
+    source: str = choice_field("kiss-icp", "dataset")
+    voxel_size_m: float = number_field(0.5, 0.05, 10)
+    min_range_m: float = number_field(2.8, 0, 50)
+    max_range_m: float = number_field(120.0, 5, 500)
     deskew: bool = True
 
     def __post_init__(self) -> None:
@@ -97,14 +92,18 @@ class FlowSettings(Section):
     """Settings for scene flow."""
 
     engine: str = "groups"
-    look_around_s: float | None = within(None, 0, 5)
+    look_around_s: float | None = number_field(None, 0, 5)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return how far to search beyond the window and the step (0 every sweep), in seconds."""
+        """Return two times in seconds: how far around a window motion is searched, and its step.
+
+        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar: sparse sweeps are
+        searched farther, and all of them.
+        """
         # Sparse sweeps show little of a moving object, so more of them are searched, and farther.
         is_sparse = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
@@ -115,9 +114,9 @@ class FlowSettings(Section):
 class ObjectiveSettings(Section):
     """Settings of engine paper; all but static_prior also apply to the flow of two point files."""
 
-    solver: str = one_of("pcg", "adam")
-    alpha: float = within(10.0, 0, 1e6)
-    num_neighbors: int = within(50, 1, 500)
+    solver: str = choice_field("pcg", "adam")
+    alpha: float = number_field(10.0, 0, 1e6)
+    num_neighbors: int = number_field(50, 1, 500)
     static_prior: bool = True
 
 
@@ -125,21 +124,21 @@ class ObjectiveSettings(Section):
 class AccumulateSettings(Section):
     """Settings for the accumulated cloud at the key's time."""
 
-    unfollowed: str = one_of("drop", "rigid")
-    far_m: float = within(40.0, 0, 500)
+    unfollowed: str = choice_field("drop", "rigid")
+    far_m: float = number_field(40.0, 0, 500)
 
 
 @dataclass(frozen=True)
 class ProjectSettings(Section):
     """Settings for depth maps of the accumulated cloud."""
 
-    at: str = one_of("camera", "sweep")
-    per: str = one_of("sweep", "image")
-    depth: str = one_of("auto", "z", "range")
+    at: str = choice_field("camera", "sweep")
+    per: str = choice_field("sweep", "image")
+    depth: str = choice_field("auto", "z", "range")
     visibility: bool = True
-    rims: str = one_of("image", "strict", "keep")
-    fill_reach: float = within(1.5, 0.1, 5)
-    max_outliers: float | None = within(None, 0.0001, 1)
+    rims: str = choice_field("image", "strict", "keep")
+    fill_reach: float = number_field(1.5, 0.1, 5)
+    max_outliers: float | None = number_field(None, 0.0001, 1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -154,24 +153,27 @@ class ProjectSettings(Section):
 class PriorSettings(Section):
     """Settings for depth images from the user (--prior), which complete unmeasured pixels."""
 
-    kind: str = one_of("auto", "depth", "inverse")
+    kind: str = choice_field("auto", "depth", "inverse")
 
 
 @dataclass(frozen=True)
 class OutputSettings(Section):
     """Settings for files in addition to the files that every run writes."""
 
-    flow: str = one_of("none", "npz")
+    flow: str = choice_field("none", "npz")
     optical_flow: bool = False
     rejected: bool = False
     score: bool = False
     report: bool = False
-    movers: str = one_of("keep", "drop", "separate")
+    movers: str = choice_field("keep", "drop", "separate")
 
 
 @dataclass(frozen=True)
 class Config:
-    """The whole configuration, one section per stage; ``Config()`` has the defaults."""
+    """The whole configuration, one section per stage; ``Config()`` has the defaults.
+
+    ``configs/default.yaml`` describes each setting.
+    """
 
     register: RegisterSettings = RegisterSettings()
     flow: FlowSettings = FlowSettings()
@@ -187,7 +189,7 @@ class Config:
         return self.output.score or self.output.report
 
     def scored(self) -> Config:
-        """Return this configuration with ``output.score`` set."""
+        """Return a copy of this configuration with ``output.score`` set to True."""
         return replace(self, output=replace(self.output, score=True))
 
 
@@ -197,11 +199,16 @@ _SECTIONS: dict[str, Any] = {f.name: type(f.default) for f in fields(Config)}
 def resolve(
     config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> Config:
-    """Return the settings given by ``config``, then changed by the overrides.
+    """Return the settings that ``config`` gives, changed by the overrides.
 
-    ``config`` is None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to
-    a YAML file of that form; or a str, the name of a preset or else of a file. Settings that are
-    not given have their defaults. Overrides are ``section.key=value``, with values as in YAML.
+    Args:
+        config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a
+            YAML file of that form; or a str, the name of a preset or else of a file. Settings that
+            are not given have their defaults.
+        overrides: Texts ``section.key=value``, with values as in YAML. Later ones win.
+
+    Raises:
+        InputError: A file, section or key does not exist, or a value does not fit its setting.
     """
     values = as_mapping(config if isinstance(config, Config) else Config())
     if isinstance(config, Mapping):
@@ -219,11 +226,11 @@ def resolve(
 
 
 def as_mapping(config: Config) -> dict[str, dict[str, Any]]:
-    """Return ``{section: {key: value}}`` with every setting; `resolve` inverts it."""
+    """Return every setting as ``{section: {key: value}}``, from which `resolve` makes it again."""
     return asdict(config)
 
 
-def changed(config: Config) -> dict[str, dict[str, Any]]:
+def find_changes(config: Config) -> dict[str, dict[str, Any]]:
     """Return ``{section: {key: value}}`` with the settings that differ from their defaults."""
     defaults = as_mapping(Config())
     changes = {
@@ -234,7 +241,7 @@ def changed(config: Config) -> dict[str, dict[str, Any]]:
 
 
 def presets() -> dict[str, Path]:
-    """Return the YAML file of each preset, by name."""
+    """Return the path of the YAML file of each preset, by the preset's name."""
     package = Path(__file__).parents[1]
     inside = package / "configs"  # installed
     folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
@@ -255,7 +262,11 @@ def apply_overrides(
     overrides: Iterable[str],
     sections: Mapping[str, type[Section]] = _SECTIONS,
 ) -> None:
-    """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``."""
+    """Overwrite settings ``{section: {key: value}}`` in place by texts ``section.key=value``.
+
+    ``sections`` has the class of each section. Raise InputError for a text of another form, an
+    unknown key, or a value that does not fit.
+    """
     for override in overrides:
         where = f"--set {override}"
         name, equals, text = override.partition("=")
@@ -285,7 +296,7 @@ def _apply_changes(
                 owners = [section for section, known in values.items() if key in known]
                 hint = f"did you mean {owners[0]}.{key}?" if owners else hint
                 raise InputError(f"{where}: unknown key {name}.{key}; {hint}")
-            values[name][key] = checked(sections[name], key, value, f"{where}: ")
+            values[name][key] = _convert_value(sections[name], key, value, f"{where}: ")
 
 
 def _mapping(value: Any, where: str, content: str) -> Iterable[tuple[Any, Any]]:

@@ -40,10 +40,14 @@ _MOST_ENTRIES = 10_000
 
 
 class Cache:
-    """A folder of cached results."""
+    """A folder of cached results of pipeline steps, each in a ``.npz`` file."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
-        """Open a folder of entries, by default the user's; if that fails, warn and keep nothing."""
+        """Open a folder of entries; if it cannot be made, warn, and keep no results.
+
+        `trim` reduces it to ``limit_bytes``. ``folder`` None is ``steps`` in the user's cache
+        folder.
+        """
         self._folder = folder or own_folder("steps")
         self._limit_bytes = limit_bytes
         try:
@@ -54,10 +58,12 @@ class Cache:
     def get(self, step: str, inputs: Any, make: Callable[[], T]) -> T:
         """Return the cached result of a step, or make and keep it.
 
+        A result that cannot be stored is returned all the same.
+
         Args:
             step: Name of the step, with which the entry's file name begins.
             inputs: All that the result depends on, of types that `digest` accepts.
-            make: Function that makes the result.
+            make: Function that makes the result. If files can be locked, one process calls it.
         """
         path = self._folder / f"{step}-{digest((__version__, inputs))}.npz"
         if (entry := _read(path)) is not None:
@@ -68,13 +74,13 @@ class Cache:
             value = make()
             try:
                 text, arrays = _packed(value)
-                save_arrays(path, {"json": np.frombuffer(text, np.uint8), **arrays})
+                _save_arrays(path, {"json": np.frombuffer(text, np.uint8), **arrays})
             except (OSError, TypeError) as error:
                 _log.debug("%s: not kept: %s", path, error)
             return value
 
     def trim(self) -> None:
-        """Delete the least recently used entries until the size is within the limit."""
+        """Delete the least recently used entries beyond ``limit_bytes`` or 10,000 files."""
         entries: list[tuple[int, Path, int]] = []
         for path in self._folder.iterdir() if self._folder.is_dir() else ():
             with suppress(OSError):  # another process deletes too
@@ -122,7 +128,7 @@ def _only_maker(path: Path) -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def code_digest() -> str:
-    """Return a hash of the code that makes the pipeline's cached results."""
+    """Return the hexadecimal hash of the source files that make the pipeline's cached results."""
     state = hashlib.blake2b(digest_size=20)
     package = Path(__file__).parents[1]
     for path in sorted(path for room in _STEP_ROOMS for path in package.glob(room)):
@@ -130,12 +136,17 @@ def code_digest() -> str:
     return state.hexdigest()
 
 
-def kept(cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]) -> T:
-    """Return `Cache.get`, or without a cache the result of ``make`` without calling ``inputs``."""
+def get_cached(
+    cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]
+) -> T:
+    """Return a result by `Cache.get`; without a cache, call ``make`` alone.
+
+    ``inputs`` returns the inputs of `Cache.get`. It is not called without a cache.
+    """
     return make() if cache is None else cache.get(step, inputs(), make)
 
 
-def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+def _save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write an ``.npz`` file atomically, through a temporary file in the same folder."""
     number, aside = tempfile.mkstemp(".tmp", dir=path.parent)
     try:
@@ -201,7 +212,11 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def own_folder(name: str) -> Path:
-    """Make and return the user's own cache folder of this name, by DENSIFY_CACHE_DIR if set."""
+    """Return the folder ``name`` in the user's cache folder, made if it does not exist.
+
+    The cache folder is DENSIFY_CACHE_DIR, or else the system's usual one. Raise InputError if other
+    users can write to either folder. A folder that cannot be made is no error here.
+    """
     named = os.environ.get("DENSIFY_CACHE_DIR")
     root = Path(named or platformdirs.user_cache_dir("densify"))
     for folder in (root, root / name):
@@ -216,7 +231,7 @@ def own_folder(name: str) -> Path:
 
 
 def others_can_write(folder: Path) -> bool:
-    """Return True if users other than this user and root can write to an existing folder."""
+    """Return True if others than this user and root can write to a folder, False without it."""
     try:
         status = folder.stat()
     except OSError:

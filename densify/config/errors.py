@@ -12,8 +12,8 @@ _BREAK = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 _MOST_CHARACTERS = 1000
 
 
-def brief(message: str) -> str:
-    """Return the message on one line, with long quoted values and long words shortened."""
+def shorten_message(message: str) -> str:
+    """Return the message on one line of at most 1000 characters, long quoted values cut to 200."""
     message = _LONG_VALUE.sub(lambda match: _cut(match[0], 200), _BREAK.sub(" ", message))
     return _cut(message, _MOST_CHARACTERS) if len(message) > _MOST_CHARACTERS else message
 
@@ -25,23 +25,23 @@ def _cut(text: str, num_characters: int) -> str:
 
 
 def how_to_install(extra: str) -> str:
-    """Return the commands that install an extra; ``densify`` on the index is another project."""
+    """Return the commands that install an extra, such as ``ros``, of the package densify-lidar."""
     return f"pip install 'densify-lidar[{extra}]', or in a checkout pip install '.[{extra}]'"
 
 
 def did_you_mean(got: str, known: Iterable[str]) -> str:
-    """Return ``did you mean NAME? `` with the known name most similar to ``got``, else ""."""
+    """Return ``did you mean NAME? `` with the most similar known name, "" if none is similar."""
     close = difflib.get_close_matches(got, list(known), n=1, cutoff=0.6)
     return f"did you mean {close[0]}? " if close else ""
 
 
 class _ShortError(Exception):
     def __init__(self, message: str, *args: object) -> None:
-        super().__init__(brief(message), *args)
+        super().__init__(shorten_message(message), *args)
 
 
 class InputError(_ShortError):
-    """Input, configuration or output path that cannot be used. Exit code 2."""
+    """Input, configuration or output path that cannot be used. The command line exits with 2."""
 
 
 class OutputError(InputError):
@@ -49,7 +49,7 @@ class OutputError(InputError):
 
 
 class ComputationError(_ShortError):
-    """A result that a stage found to be unreliable. Exit code 1."""
+    """A result that a stage found to be unreliable. The command line exits with 1."""
 
 
 class SweepError(_ShortError):

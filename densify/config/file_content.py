@@ -27,7 +27,7 @@ _MALFORMED = (LookupError, TypeError, ValueError, AttributeError, OverflowError)
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a file for reading; the caller closes it."""
+    """Return a file opened for reading bytes, which the caller closes; InputError if unreadable."""
     try:
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -43,7 +43,7 @@ def open_file(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return the content of a file; raise InputError if it cannot be read or is too large."""
+    """Return the content of a file; raise InputError if unreadable or over ``most_bytes``."""
     with open_file(path) as file:
         check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
         try:
@@ -52,8 +52,8 @@ def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
             raise InputError(f"{path}: cannot be read: {reason(error)}") from error
 
 
-def gunzipped(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return decompressed gzip data."""
+def gunzip(data: bytes, where: Path | str, most_bytes: int = MOST_BYTES) -> bytes:
+    """Return decompressed gzip data; raise InputError if damaged, empty or too large unpacked."""
     try:
         with gzip.open(io.BytesIO(data)) as file:
             content = file.read(most_bytes + 1)
@@ -74,18 +74,18 @@ def check_size(num_bytes: int, where: Path | str, most_bytes: int = MOST_BYTES) 
 
 
 def reason(error: BaseException) -> str:
-    """Return the message of an exception on one line."""
+    """Return the message of an exception on one line, or the name of its type without a message."""
     said = error.strerror if isinstance(error, OSError) else None
     return said or " ".join(str(error).split()) or type(error).__name__
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """Return the text of a UTF-8 file, without a byte order mark."""
+    """Return the text of a UTF-8 file without a byte order mark; InputError for other files."""
     return decode_text(read_bytes(path, most_bytes), path)
 
 
 def decode_text(data: bytes, where: Path | str) -> str:
-    """Return UTF-8 text without a byte order mark; raise InputError, with ``where`` first, else."""
+    """Return UTF-8 bytes as text, no byte order mark; InputError, ``where`` first, for others."""
     # Every second byte of plain words in UTF-16 is zero.
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or data[:2].count(0) == 1:
         raise InputError(f"{where}: is text in UTF-16, expected UTF-8; save it as UTF-8")
@@ -96,12 +96,12 @@ def decode_text(data: bytes, where: Path | str) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file; raise InputError if it is damaged."""
+    """Return the content of a JSON file as Python values; raise InputError if it is damaged."""
     return parse_json(read_bytes(path), path)
 
 
 def parse_json(data: bytes, where: Path | str) -> Any:
-    """Return the content of JSON text; raise InputError, starting with ``where``, if invalid."""
+    """Return the value of JSON bytes; raise InputError, starting with ``where``, if invalid."""
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -111,12 +111,16 @@ def parse_json(data: bytes, where: Path | str) -> Any:
 
 
 def read_yaml(path: Path) -> tuple[Any, dict[str, int]]:
-    """Return the content of a YAML file and the line of each key, as `parse_yaml` does."""
+    """Return a YAML file's content, None if empty, and the line number of each dotted key."""
     return parse_yaml(read_text(path, _MOST_YAML_BYTES), path)
 
 
 def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
-    """Return the content of YAML text, None if empty, and the line number of each dotted key."""
+    """Return the content of YAML text, None if empty, and the line number of each dotted key.
+
+    A key ``b`` in a mapping ``a`` is ``a.b``. Raise InputError, whose message begins with
+    ``where``, for invalid text, a key that is given twice, or more than 30 aliases.
+    """
     import yaml
 
     try:
@@ -148,8 +152,14 @@ def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
         _note_lines(value, full, lines)
 
 
-def needed(module: str, extra: str, needed_by: str) -> Any:
-    """Import and return an optional module, which the ``extra`` of this package installs."""
+def import_extra(module: str, extra: str, needed_by: str) -> Any:
+    """Return an optional module after importing it; raise InputError if that fails.
+
+    Args:
+        module: Import path of the module.
+        extra: Extra of this package that installs it.
+        needed_by: What needs the module, in the plural, for messages.
+    """
     package = module.partition(".")[0]
     try:
         return import_module(module)
@@ -166,7 +176,7 @@ def needed(module: str, extra: str, needed_by: str) -> Any:
 
 @contextmanager
 def described_in(where: Path | str, expected: str) -> Iterator[None]:
-    """Turn a missing key or malformed value in the block into an InputError, with ``expected``."""
+    """Turn malformed content in the block into an InputError of ``where`` with ``expected``."""
     try:
         yield
     except InputError:

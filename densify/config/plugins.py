@@ -40,11 +40,11 @@ class Plugin:
 
     @property
     def usage(self) -> str:
-        """Name and argument as users write them."""
+        """Name and argument as users write them, such as ``npz:DIR``."""
         return f"{self.name}:{self.argument}" if self.argument else self.name
 
-    def work(self) -> Any:
-        """Import and return the plug-in's module."""
+    def load_module(self) -> Any:
+        """Return the plug-in's module after importing it."""
         return import_module(self.module)
 
 
@@ -58,11 +58,11 @@ class Table:
     built_in: tuple[Plugin, ...]  # plug-ins of densify
 
     def names(self) -> list[str]:
-        """Return the names of all plug-ins, the built-in ones first; import none."""
+        """Return the names of all plug-ins, the built-in ones first, without importing any."""
         return [*self._rows()]
 
     def require(self, name: str, where: str) -> None:
-        """Raise InputError, starting with ``where``, if no plug-in has this name; import none."""
+        """Raise InputError, starting with ``where``, if no plug-in has this name. Import none."""
         rows = self._rows()
         if name not in rows:
             usages = [getattr(row, "usage", row.name) for row in rows.values()]
@@ -71,8 +71,8 @@ class Table:
                 f"{', '.join(usages)} (packages add others by entry points in {self.group})"
             )
 
-    def row(self, name: str, where: str) -> Plugin:
-        """Return the plug-in of this name; another package's module is imported."""
+    def plugin(self, name: str, where: str) -> Plugin:
+        """Return the plug-in of this name; InputError if there is none or it cannot be imported."""
         self.require(name, where)
         return self._loaded(self._rows()[name])
 
@@ -134,7 +134,11 @@ ENGINES = Table(
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
-    """Split an engine's ``NAME[:ARGUMENT]`` into name and argument, "" for none, without import."""
+    """Return the name and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``.
+
+    No module is imported. Raise InputError if no engine has this name, or if a built-in engine has
+    an argument too many or lacks its argument.
+    """
     name, _, argument = spec.partition(":")
     ENGINES.require(name, "flow.engine")
     for row in ENGINES.built_in:
@@ -146,7 +150,7 @@ def check_engine_spec(spec: str) -> tuple[str, str]:
 def engine(spec: str) -> tuple[Plugin, str]:
     """Return the plug-in and the argument ("" for none) of an engine's ``NAME[:ARGUMENT]``."""
     name, argument = check_engine_spec(spec)
-    return ENGINES.row(name, "flow.engine"), argument
+    return ENGINES.plugin(name, "flow.engine"), argument
 
 
 def _any(*patterns: str) -> Callable[[Path], bool]:

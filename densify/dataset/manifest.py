@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from densify.config.errors import InputError, OutputError
-from densify.config.file_content import needed, parse_json, read_bytes
+from densify.config.file_content import import_extra, parse_json, read_bytes
 from densify.outputs.atomic import plain, write_file
 from densify.outputs.kitti_tree import FileRecord
 
@@ -101,7 +101,7 @@ def manifest(folder: str | Path) -> Any:
     ``warnings``, and the scores, those of cameras as ``density.image_02``. Without pandas,
     InputError is raised. A folder without a manifest gives an empty table.
     """
-    pandas = needed("pandas", "pandas", "tables of a manifest")
+    pandas = import_extra("pandas", "pandas", "tables of a manifest")
     rows = []
     for record in read_manifests(Path(folder)).values():
         row = {name: getattr(record, name) for name in ("drive", "key", "status", "reason")}

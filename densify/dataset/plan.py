@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.config import Config, Section, as_mapping, one_of, within
+from densify.config import Config, Section, as_mapping, choice_field, number_field
 from densify.config.errors import InputError
 from densify.config.file_content import read_json
 from densify.geometry.types import Camera, LidarSequence
@@ -29,7 +29,7 @@ from densify.outputs.atomic import plain, write_file
 from densify.outputs.recording_folder import drive_folder, is_same, split_of
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
-from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, runs
+from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, to_runs
 from densify.version import __version__
 
 SCHEMA_VERSION = 1
@@ -57,12 +57,12 @@ class Gate(Section):
         split: Split of the tree, ``train`` or ``val``; ``kitti`` takes KITTI's official split.
     """
 
-    max_ghost: float | None = within(None, 0, 1)
-    min_density: float | None = within(None, 0, 1)
-    max_outliers: float | None = within(None, 0, 1)
-    min_sweeps: int | None = within(None, 1, 101)
-    max_ratio: float | None = within(4.0, 1, 1e6)
-    split: str = one_of("kitti", "train", "val")
+    max_ghost: float | None = number_field(None, 0, 1)
+    min_density: float | None = number_field(None, 0, 1)
+    max_outliers: float | None = number_field(None, 0, 1)
+    min_sweeps: int | None = number_field(None, 1, 101)
+    max_ratio: float | None = number_field(4.0, 1, 1e6)
+    split: str = choice_field("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
         """Return why a key sweep is beyond a limit, None if it is within all limits.
@@ -315,7 +315,7 @@ def _read_camera(name: str, stored: Mapping[str, Any]) -> Camera:
 
 def _as_runs(frames: Iterable[int]) -> list[list[int]]:
     """Return ascending frame numbers as runs [first, last]."""
-    return [[run[0], run[-1]] for run in runs(frames)]
+    return [[run[0], run[-1]] for run in to_runs(frames)]
 
 
 def _frames(ends: Iterable[Sequence[int]]) -> list[int]:

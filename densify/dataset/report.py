@@ -22,7 +22,7 @@ from densify.dataset.manifest import KeyRecord, read_manifests
 from densify.dataset.plan import planned_keys, read_plan
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import metres, read_stored
-from densify.outputs.plots import coloured, score_figure
+from densify.outputs.plots import colour_depth, score_figure
 from densify.outputs.report_page import KeyFiles, key_page
 
 _NUM_WORST, _NUM_SPREAD = 6, 18  # keys with pictures: the worst, and others spread over the set
@@ -160,7 +160,7 @@ def _card(root: Path, record: KeyRecord) -> str:
 
 
 def _depth_picture(path: Path) -> NDArray[np.uint8]:
-    return coloured(metres(_small(read_stored(path, np.uint16, "a depth map"))))
+    return colour_depth(metres(_small(read_stored(path, np.uint16, "a depth map"))))
 
 
 def _confidence_picture(path: Path) -> NDArray[np.uint8]:

@@ -32,7 +32,7 @@ from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry import poses
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.timeline import format_frames, in_range
+from densify.readers.timeline import format_frames, remove_unusable_returns
 from densify.registration.deskew import (
     CLEARLY,
     COMPENSATED_M,
@@ -112,7 +112,7 @@ def check_sensors(sample: Sample) -> list[Finding]:
     if sample.unregistered:
         return [finding("scanners", UNKNOWN, sample.unregistered)]
     sweeps = [
-        replace(registered, sweep=in_range(registered.sweep, sample.settings))
+        replace(registered, sweep=remove_unusable_returns(registered.sweep, sample.settings))
         for registered in sample.fastest.stretch.sweeps
     ]
     models = Sensors.of(sweeps).models

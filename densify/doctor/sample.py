@@ -13,7 +13,7 @@ import numpy as np
 from densify.config import RegisterSettings
 from densify.config.errors import InputError, SweepError
 from densify.geometry.types import Float, LidarSequence, Stretch, Sweep, Trajectory
-from densify.readers.timeline import Timeline, in_range
+from densify.readers.timeline import Timeline, remove_unusable_returns
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import find_trajectory
 
@@ -71,7 +71,7 @@ class Spot:
         if len(sweeps) < 2:
             return Spot(sweeps, None, "one sweep alone cannot be registered")
         try:
-            sweeps_in_range = [in_range(sweep, settings) for sweep in sweeps]
+            sweeps_in_range = [remove_unusable_returns(sweep, settings) for sweep in sweeps]
             trajectory = find_trajectory(sweeps_in_range, settings)
         except SweepError as error:
             return Spot(sweeps, None, str(error))
@@ -169,7 +169,7 @@ class Sample:
 def choose_frames(timeline: Timeline) -> list[list[int]]:
     """Return the frame numbers of up to 3 spots, each of up to 5 sweeps about 0.1 s apart."""
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
-    runs = timeline.runs(timeline.frames)  # without a hole in time
+    runs = timeline.split_at_holes(timeline.frames)  # without a hole in time
     # from the first to the last sweep of a spot, both included
     length = min(max(map(len, runs)), stride * (_NUM_SWEEPS - 1) + 1)
     candidates = [

@@ -69,13 +69,13 @@ class EngineModule(Protocol):
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
     """Return the motion of a scene by the engine ``NAME[:ARGUMENT]``; None for ``flow.engine``."""
     row, argument = engine(spec or settings.flow.engine)
-    module = cast(EngineModule, row.work())
+    module = cast(EngineModule, row.load_module())
     return module.estimate_motion(scene, settings, argument)
 
 
 def check_engine(spec: str) -> None:
     """Import an engine ``NAME[:ARGUMENT]`` and check its argument; InputError if it is bad."""
     row, argument = engine(spec)
-    check = getattr(row.work(), "check_argument", None)
+    check = getattr(row.load_module(), "check_argument", None)
     if check is not None:
         check(argument)

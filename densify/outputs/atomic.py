@@ -71,7 +71,7 @@ def staged_folder(folder: Path, owned: Collection[str]) -> Iterator[Path]:
 
 
 def clear_leftovers(root: Path, age_s: float = LEFT_AFTER_S) -> None:
-    """Remove the hidden folders that killed processes left anywhere under ``root``."""
+    """Remove hidden folders under ``root`` that killed processes left ``age_s`` or more ago."""
     # Another process may still write in folders younger than ``age_s`` seconds.
     for folder, names, _ in os.walk(root):  # skips entries that other processes remove meanwhile
         for name in names:

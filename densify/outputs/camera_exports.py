@@ -68,8 +68,9 @@ def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     The static world is a COLMAP model. Depth maps are for ``-d depths``: inverse depth is ``value /
     65536 * scale + offset``, by ``sparse/0/depth_params.json``. As an empty pixel counts as
     infinitely far, images are transparent, and not trained, where depth is unknown.
-    ``movers/0003.ply`` has the points of object 3 in its own frame, ``movers/others.ply`` moving
-    points without a track in the key sweep's lidar frame; with several runs in ``movers/000120/``.
+    ``movers/0003.ply`` has the points of object 3 in its own frame. ``movers/others.ply`` has
+    moving points without a track in the key sweep's lidar frame. With several runs, both are in
+    ``movers/000120/``. ``tracks.json`` is each run's ``movers.json``.
     """
     pictures = _pictures(runs, flat=True)
     cloud = _world_cloud(runs)

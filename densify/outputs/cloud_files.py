@@ -98,7 +98,7 @@ class StoredCloud:
         return StoredCloud(**columns)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the (M,) values of each column by LAZ name; booleans uint8, positions float32."""
+        """Return the (M,) columns by their names in cloud.laz: booleans uint8, position float32."""
         names = ("intensity", "confidence", "displaced", "frame", "instance", "gps_time")
         return {  # float32 keeps 1 mm up to 8 km
             **dict(zip("xyz", self.points.T.astype(np.float32), strict=True)),
@@ -110,10 +110,11 @@ class StoredCloud:
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
-    """Write a cloud as LAZ with the extra dimensions of `_EXTRA_DIMENSIONS`, rounded to 1 mm.
+    """Write a cloud as LAZ with positions rounded to 1 mm; ``stamp_ns`` is the key sweep's time.
 
     ``gps_time`` is as in LAS 1.4: seconds since 1980-01-06 minus 10^9, without leap seconds. The
-    header has the day of ``stamp_ns``. Equal clouds give equal bytes.
+    header has the day of ``stamp_ns``. Equal clouds give equal bytes. Raise ValueError for points
+    that are not finite or beyond 2,147 km.
     """
     import laspy
 
@@ -171,7 +172,7 @@ def read_cloud(path: Path) -> StoredCloud:
 
 
 def save_ply(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write (N,) columns by name as vertices of PLY (Turk, 1994), binary, little-endian."""
+    """Write (N,) columns of types f4, f8, i4, u1 and u2 by name as PLY vertices (Turk, 1994)."""
     rows = table(columns)
     rows = rows.astype(rows.dtype.newbyteorder("<"), copy=False)
     kinds = {name: _PLY_TYPES[rows.dtype[name].str.lstrip("<|")] for name in columns}

@@ -28,7 +28,7 @@ _MAX_VALUE = np.iinfo(np.uint16).max
 
 
 def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
-    """Return the bytes of a PNG file of an image (H,W), or (H,W,3) as blue, green, red."""
+    """Return PNG bytes of (H,W) or (H,W,3 or 4) pixels: blue, green, red, alpha, 8 or 16 bits."""
     return cv2.imencode(".png", np.ascontiguousarray(image))[1].tobytes()
 
 
@@ -108,7 +108,7 @@ def metres(stored: NDArray[np.uint16]) -> Float32:
 
 
 def read_depth_png(path: Path) -> Float32:
-    """Return the (H,W) depth in metres of a PNG, 0 for no depth."""
+    """Return the (H,W) float32 depth in metres of a depth map's PNG, 0 for no depth."""
     return metres(read_stored(path, np.uint16, "a depth map"))
 
 
@@ -116,7 +116,7 @@ PixelType = type[np.uint8] | type[np.uint16]
 
 
 def read_stored(path: Path, kind: PixelType, map_name: str) -> NDArray[Any]:
-    """Return the (H,W) pixel values of a PNG as stored."""
+    """Return a PNG's (H,W) values; InputError, "expected ``map_name``", if not of type ``kind``."""
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"
@@ -126,7 +126,7 @@ def read_stored(path: Path, kind: PixelType, map_name: str) -> NDArray[Any]:
 
 
 def read_mask_png(path: Path) -> Bool:
-    """Return an (H,W) mask, True where any colour channel is above 0. Transparency is ignored."""
+    """Return an (H,W) mask, True where a colour channel is above 0; transparency is ignored."""
     image = read_image(path, as_stored=True)
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
     mask: Bool = colours > 0

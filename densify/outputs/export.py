@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from densify.config.errors import InputError, did_you_mean
-from densify.config.file_content import needed
+from densify.config.file_content import import_extra
 from densify.config.plugins import EXPORTS
 from densify.geometry.types import Float32
 from densify.outputs.atomic import plain
@@ -49,7 +49,7 @@ def export_run(
     cameras: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> Export:
-    """Write a finished run in another format, from its files alone.
+    """Write a finished run in another format, from its files alone; return what was written.
 
     Args:
         run: Folder of one key sweep, or of several for formats of whole drives.
@@ -58,7 +58,11 @@ def export_run(
         min_confidence: Least confidence of pixels and points, 0 to 1.
         max_age_ms: Greatest time from the measurement to the exposure (pixels) or the key sweep
             (points); None for any.
-        overwrite: Replace an earlier export.
+        cameras: Names of the cameras, None for all.
+        overwrite: True to replace an earlier export.
+
+    Raises:
+        InputError: An argument is out of range or unknown, the run is damaged, or files exist.
     """
     if not 0 <= min_confidence <= 1:
         raise InputError(f"--min-confidence {min_confidence}: expected a number from 0 to 1")
@@ -91,7 +95,7 @@ def export_run(
 
 
 def facts(export: Export) -> dict[str, Any]:
-    """Return the fields ``density`` and ``num_points`` of export.yaml, each only if known."""
+    """Return the known ones of the fields ``density`` and ``num_points`` of export.yaml."""
     density = {
         camera: {product: kept._asdict() for product, kept in products.items()}
         for camera, products in export.density.items()
@@ -122,8 +126,8 @@ def write_exr(run: FinishedRun, folder: Path) -> None:
 
 
 def exr_writer() -> Callable[[Path, str, Float32], None]:
-    """Return a function that writes a channel by name, (H,W) float32, as an OpenEXR file."""
-    library = needed("OpenEXR", "exr", "EXR files")
+    """Return a function that writes (H,W) float32 as an OpenEXR file: path, channel, values."""
+    library = import_extra("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
 
     def write(path: Path, channel: str, values: Float32) -> None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config.errors import InputError, brief
+from densify.config.errors import InputError, shorten_message
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry import poses
 from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
@@ -97,7 +97,10 @@ class LoadedResult:
 
 
 def load_result(folder: str | Path) -> LoadedResult:
-    """Return the arrays of a finished run from its folder, such as densify-out/street/000120."""
+    """Return the arrays of a finished run from its folder, such as densify-out/street/000120.
+
+    Raise InputError if a file of the run is missing or damaged.
+    """
     run = FinishedRun(Path(folder))
     with _damage_named(run.folder / "metrics.json"):
         metrics = read_json(run.folder / "metrics.json")
@@ -125,7 +128,7 @@ class FinishedRun:
     """The folder of one densified key sweep. Files are read on demand and may raise InputError."""
 
     def __init__(self, folder: Path, thresholds: Thresholds = EVERYTHING) -> None:
-        """Open a folder with run.yaml; raise InputError without it."""
+        """Open a folder with run.yaml, to read within ``thresholds``; InputError without it."""
         path = folder / "run.yaml"
         if not path.is_file():
             raise InputError(
@@ -213,6 +216,7 @@ class FinishedRun:
         """Return the (H,W) stored values of a camera's maps, 0 beyond a threshold.
 
         The keys are depth, depth_filled, confidence and age, values of `densify.outputs.depth_png`.
+        This also enters the shares of pixels into ``density``.
         """
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
@@ -257,7 +261,7 @@ class FinishedRun:
 
 
 def finished_runs(folder: Path, thresholds: Thresholds = EVERYTHING) -> list[FinishedRun]:
-    """Return the run in a folder, or those up to two levels below, by parent folder and frame."""
+    """Return the run in a folder, else those up to two levels below, by parent folder and key."""
     paths = [path for depth in ("*", "*/*") for path in folder.glob(f"{depth}/run.yaml")]
     folders = sorted(path.parent for path in paths)
     if (folder / "run.yaml").is_file() or not folders:
@@ -311,7 +315,7 @@ def read_scene(path: Path) -> SceneFile:
         return SceneFile(
             table,
             {name: _view(view) for name, view in table["views"].items()},
-            {f: checks.rigid(T, "T_key_lidar") for f, T in T_key_lidar.items() if T is not None},
+            {f: checks.pose(T, "T_key_lidar") for f, T in T_key_lidar.items() if T is not None},
         )
 
 
@@ -333,7 +337,7 @@ def _damage_named(path: Path) -> Iterator[None]:
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
         if str(error).startswith(str(path)):
             raise
-        reason = brief(f"{type(error).__name__}: {error}")
+        reason = shorten_message(f"{type(error).__name__}: {error}")
         raise InputError(
             f"{path}: damaged, or of another version ({reason}); densify the key again"
         ) from error
@@ -343,21 +347,21 @@ def _view(entry: Mapping[str, Any]) -> CameraView:
     """Return the camera and pose of an entry in scene.json."""
     values = {field.name: entry[field.name] for field in fields(Camera)} | {
         "K": _array(entry["K"], 3, 3),
-        "T_cam_lidar": checks.rigid(entry["T_cam_lidar"], "T_cam_lidar"),
+        "T_cam_lidar": checks.pose(entry["T_cam_lidar"], "T_cam_lidar"),
         "distortion": tuple(map(float, entry["distortion"])),
     }
     camera = Camera(**values)
     is_known = camera.model in ("pinhole", "fisheye", "mei")
     if not is_known or not min(camera.width_px, camera.height_px, camera.K[0, 0]) > 0:
         raise ValueError(f"camera {camera.name}: size, model or K")
-    T_cam_key = checks.rigid(entry["T_cam_key"], "T_cam_key")
+    T_cam_key = checks.pose(entry["T_cam_key"], "T_cam_key")
     return CameraView(camera, T_cam_key, float(entry["late_s"]), entry["number"])
 
 
 def _track(entry: Mapping[str, Any]) -> ObjectTrack:
     """Return the track of an entry in movers.json."""
     columns = {name: [pose[name] for pose in entry["poses"]] for name in entry["poses"][0]}
-    T_key_object = [checks.rigid(T, "T_key_object") for T in columns["T_key_object"]]
+    T_key_object = [checks.pose(T, "T_key_object") for T in columns["T_key_object"]]
     return ObjectTrack(
         instance=int(entry["instance"]),
         size_m=_array(entry["size_m"], 3),

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed
+from densify.config.file_content import import_extra
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
 from densify.geometry.types import Float, FlowField, Int, LidarSequence, Stretch, StretchFlow
@@ -41,10 +41,14 @@ flow to the previous sweep instead."""
 def flow_writer(
     form: str, sequence: LidarSequence, out: Path, frames: Sequence[int], overwrite: bool
 ) -> Iterator[FlowWriter]:
-    """Yield a function that writes the flow of one sweep as ``form``; ``frames`` ascend."""
+    """Yield a function that writes the flow of one sweep, a `FlowWriter`.
+
+    ``form`` is npz, av2, opensceneflow, semantickitti or doc-depth. ``frames``, of the sweeps to
+    write, ascend. Raise InputError if files exist in ``out``, unless ``overwrite`` replaces them.
+    """
     paths = {frame: _path_of(form, sequence, out, frame) for frame in frames}
     if form == "av2":
-        needed("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
+        import_extra("pyarrow.feather", "argoverse", "Argoverse 2's flow files")
     present = sorted({path.name for path in paths.values() if path.exists()})
     if present and not overwrite:
         raise InputError(
@@ -142,7 +146,7 @@ def _chained_pose(earlier: dict[int, Float], frame: int, stretch: Stretch) -> Fl
 @contextmanager
 def _open_groups(path: Path) -> Iterator[Any]:
     """Yield a new HDF5 file."""
-    h5py = needed("h5py", "opensceneflow", "OpenSceneFlow's files")
+    h5py = import_extra("h5py", "opensceneflow", "OpenSceneFlow's files")
     with file_aside(path) as aside, h5py.File(aside, "w") as file:
         yield file
 
@@ -176,7 +180,7 @@ def _num_rows(sequence: LidarSequence, frame: int) -> int:
 
 def _write_feather(path: Path, sequence: LidarSequence, frame: int, to_next: StretchFlow) -> None:
     """Write the flow of one sweep. Rows of the sweep file without a valid return have flow 0."""
-    arrow, feather = (needed(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
+    arrow, feather = (import_extra(m, "argoverse", "") for m in ("pyarrow", "pyarrow.feather"))
     num_rows = _num_rows(sequence, frame)
     residual = np.zeros((num_rows, 3), np.float16)
     for field in to_next.steps.values():

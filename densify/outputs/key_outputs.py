@@ -51,7 +51,12 @@ def check_writable(
 def write_result(
     result: Result, out: Path, *, config: Mapping[str, Any], data: str, overwrite: bool = False
 ) -> list[Path]:
-    """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files."""
+    """Write the result of one key sweep to ``out/KEY/`` and return the paths of the files.
+
+    run.yaml records ``config``, the settings ``{section: {key: value}}``, and ``data``, the text of
+    ``--data``. Raise InputError if the files exist, unless ``overwrite`` replaces them, or if
+    ``out`` has results of another recording.
+    """
     check_recording(out, result.recording, data, [result.key])
     with writing(_key_folder(out, result.key), _RUN, out, overwrite) as folder:
         for write in _WRITERS.values():
@@ -73,7 +78,10 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write compare.json, compare.png and, of the last method, ``compare/``; return the paths."""
+    """Write compare.json, compare.png and the last method's ``compare/``; return the paths.
+
+    ``results`` has method -> result. The other arguments are those of `write_result`.
+    """
     last = list(results.values())[-1]
     table = {
         "schema_version": SCHEMA_VERSION,
@@ -92,7 +100,7 @@ def write_comparison(
 
 @contextmanager
 def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Check that entries ``owned`` of a folder can be written, and yield the `staged_folder`."""
+    """Yield the `staged_folder` if entries ``owned`` can be written; else raise InputError."""
     _check_folder(folder, owned, out, overwrite)
     with staged_folder(folder, owned) as staging:
         yield staging

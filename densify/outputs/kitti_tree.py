@@ -70,6 +70,9 @@ def write_key(
     Equal maps give equal bytes.
 
     Args:
+        root: Folder of the tree.
+        folder: Path of the drive's folder in the tree, SPLIT/DRIVE.
+        frame: Frame number of the key sweep, the name of the files.
         sparse: Maps of the key sweep alone, by camera.
         dense: Maps of all sweeps, by camera.
     """
@@ -302,7 +305,7 @@ def _sized(track: ObjectTrack, of_object: Sequence[ObjectTrack]) -> ObjectTrack:
 
 
 def write_readme(root: Path, method: str, window: int, settings: Mapping[str, Any]) -> None:
-    """Write ``README.txt``, which describes the files beside it and how they were made."""
+    """Write ``README.txt`` with method, ``window`` (sweeps on each side of a key) and settings."""
     template = (files("densify.outputs") / "kitti_readme.txt").read_text("utf-8")
     text = template.format(
         version=__version__,

@@ -42,7 +42,7 @@ _MIN_TRAVEL_M = 1.0
 _SIDE = re.compile(r"left|right|side|rear|back", re.IGNORECASE)
 
 
-def front_first(
+def order_front_first(
     names: Sequence[str], views: Mapping[str, CameraView], T_key_lidar: Mapping[int, Float]
 ) -> list[str]:
     """Return the names of maps: first that of the camera that looks ahead, the others in order.
@@ -77,7 +77,7 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
     method, last = list(results.items())[-1]
     if not last.depth:
         return
-    camera = front_first([*last.depth], last.views, last.T_key_lidar)[0]
+    camera = order_front_first([*last.depth], last.views, last.T_key_lidar)[0]
     panels = [(METHOD_NAMES.get(m, m), r, "measured") for m, r in results.items()]
     if camera in last.full:
         panels.append((f"{METHOD_NAMES.get(method, method)} and prior", last, "full"))
@@ -114,7 +114,7 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
         nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
         nearest_m = cv2.erode(nearest_m, kernel).astype(np.float32, copy=False)
         picture = cv2.merge([gray, gray, gray])
-        picture[nearest_m < _NO_DEPTH_M] = coloured(nearest_m)[nearest_m < _NO_DEPTH_M]
+        picture[nearest_m < _NO_DEPTH_M] = colour_depth(nearest_m)[nearest_m < _NO_DEPTH_M]
         picture = cv2.resize(picture, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_NEAREST)
         strip = np.full((_TITLE_PX, picture.shape[1], 3), 255, np.uint8)
         _write(strip, title, _MARGIN_PX, picture.shape[1] - _MARGIN_PX)
@@ -122,7 +122,7 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     return np.concatenate([*rows, _scale(rows[0].shape[1])])
 
 
-def coloured(depth_m: Float32) -> Picture:
+def colour_depth(depth_m: Float32) -> Picture:
     """Return the (h,w,3) colours, as blue, green, red, of depths (h,w) in metres; 0 is black."""
     share = np.log(np.maximum(depth_m, _NEAR_M) / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
     levels = np.rint(255 * (1 - np.minimum(share, 1))).astype(np.uint8)
@@ -139,7 +139,7 @@ def _scale(width_px: int) -> Picture:
     bottom = _MARGIN_PX + _BAR_PX
     log_m = np.linspace(np.log(_NEAR_M), np.log(_FAR_M), bar_width_px)
     bar = scale[_MARGIN_PX:bottom, left : left + bar_width_px]
-    bar[:] = coloured(np.exp(log_m).astype(np.float32)[None])
+    bar[:] = colour_depth(np.exp(log_m).astype(np.float32)[None])
     # A tick is 2 px wide and 4 px high, with its label below.
     for tick_m in _TICKS_M:
         column = left + int(np.searchsorted(log_m, np.log(tick_m) - 1e-9))
@@ -194,7 +194,7 @@ def write_curve(result: Result, folder: Path) -> None:
 
 
 def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw the share of outliers over the density: title -> method -> `precision_density`."""
+    """Return a figure of outliers over density: title of the axes -> method -> `Curve`."""
     from matplotlib.figure import Figure
 
     columns, rows = min(2, len(curves)), -(-len(curves) // 2)

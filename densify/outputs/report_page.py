@@ -28,7 +28,7 @@ from densify.outputs.atomic import plain
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import PixelType, read_stored
 from densify.outputs.finished_run import map_names, read_scene, read_tracks
-from densify.outputs.plots import front_first
+from densify.outputs.plots import order_front_first
 from densify.readers.decoded_files import decode_image
 from densify.version import __version__
 
@@ -126,7 +126,7 @@ class KeyFiles:
         return maps
 
     def image(self, name: str) -> bytes | None:
-        """Return the JPEG bytes of the image of a map, None if the run has no image."""
+        """Return the JPEG bytes of the image of a map, None if it is missing or damaged."""
 
         def jpeg(path: Path) -> bytes:
             decode_image(data := read_bytes(path), path)
@@ -155,7 +155,7 @@ def key_page(files: KeyFiles, shown_folder: str) -> bytes:
     blobs = Blobs()
     cameras = {}
     names = map_names(files.maps / "depth", files.maps / "depth_filled")
-    for name in front_first(names, scene.views, scene.T_key_lidar) if scene else names:
+    for name in order_front_first(names, scene.views, scene.T_key_lidar) if scene else names:
         if maps := files.camera(name):
             view = scene.views.get(name) if scene else None
             focal_px = view.camera.focal_px if view else None
@@ -167,7 +167,7 @@ def key_page(files: KeyFiles, shown_folder: str) -> bytes:
     if cloud is not None and len(cloud.points):
         frames = [sweep["frame"] for sweep in sweeps]
         instances = [track.instance for track in tracks]
-        packed_points = packed_cloud(blobs, cloud, frames, instances)
+        packed_points = pack_cloud(blobs, cloud, frames, instances)
 
     about = files.about
     methods = list(files.methods)
@@ -281,7 +281,7 @@ def _packed_camera(
     return entry
 
 
-def packed_cloud(
+def pack_cloud(
     blobs: Blobs, cloud: StoredCloud, frames: Sequence[int], instances: Sequence[int]
 ) -> dict[str, Any]:
     """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
@@ -294,7 +294,7 @@ def packed_cloud(
             and up for tracked objects by ``instances``. ``displaced``, for moving points only, is
             32768 plus the displacement beyond rigid alignment in steps of ``displaced_step_m``.
     """
-    rows = thinned(cloud.points, cloud.moving, _MOST_POINTS)
+    rows = thin_cloud(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
     low = chosen.points.min(axis=0, initial=0.0)
     step_m = float(max((chosen.points - low).max(initial=0.0), 1e-3) / _MAX_UINT16)
@@ -320,8 +320,8 @@ def packed_cloud(
     }
 
 
-def thinned(points: Float, moving: Bool, max_points: int) -> Int:
-    """Return (K,) ascending indices of at most ``max_points`` points, the far ones preferred."""
+def thin_cloud(points: Float, moving: Bool, max_points: int) -> Int:
+    """Return (K,) ascending indices of ``max_points`` points at most, mostly far or moving ones."""
     if len(points) <= max_points:
         return np.arange(len(points))
     weight = np.maximum((points**2).sum(axis=1), _NEAR_M**2)
@@ -346,7 +346,11 @@ def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
 
 
 def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
-    """Return the bytes of a whole HTML page, whose script reads ``data`` as ``page``."""
+    """Return the bytes of a whole HTML page.
+
+    Its script reads ``data`` as ``page``, of types that `plain` accepts, and unpacks ``blobs``, to
+    which ``data`` refers by name.
+    """
     script, style = "\n".join(map(_source, _SCRIPTS)), _source("page.css")
     policy = (
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; "

@@ -52,7 +52,15 @@ def write_street(
     progress: Progress | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write frames of a street, all or none, and return the path to give to ``--data``."""
+    """Write frames of a street, all or none, and return the path to give to ``--data``.
+
+    Args:
+        format: ``kitti`` or ``folder``.
+        out: Folder in which the recording's folder is made.
+        frames: Frame numbers of the sweeps, in any order.
+        cameras: Names of the cameras, None for all.
+        overwrite: True to replace existing files, which else raise InputError.
+    """
     if format not in FORMATS:
         raise InputError(f"--format {format}: expected one of {', '.join(FORMATS)}")
     excerpt, is_kitti = Excerpt.of(street, frames, cameras), format == "kitti"
@@ -86,7 +94,7 @@ class Excerpt:
     def of(
         cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
-        """Return an excerpt; raise InputError for unknown frames or cameras. None: all cameras."""
+        """Return the excerpt of these frames and cameras, None for all; InputError if unknown."""
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
             checks.camera_named(street.cameras, name, Path(street.name))
@@ -107,7 +115,7 @@ class Excerpt:
         return [n for n, ns in exposed_ns.items() if begin_ns <= ns < end_ns]
 
     def png_image(self, camera: str, number: int) -> bytes:
-        """Return the bytes of an image as PNG file."""
+        """Return the bytes of an image as a PNG file."""
         return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:

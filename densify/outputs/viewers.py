@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError, OutputError
-from densify.config.file_content import needed
+from densify.config.file_content import import_extra
 from densify.geometry import poses
 from densify.geometry.arrays import table
 from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
 from densify.outputs.cloud_files import StoredCloud
 from densify.outputs.depth_png import Picture, metres
 from densify.outputs.finished_run import FinishedRun, key_poses
-from densify.outputs.plots import coloured
+from densify.outputs.plots import colour_depth
 from densify.readers.decoded_files import decode_image
 
 _NS = 10**9
@@ -85,13 +85,13 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
             frame, since_s, T = sweep["frame"], sweep["since_key_s"], sweep["T_key_lidar"]
             if frame == run.key or (len(runs) == 1 and None not in (since_s, T)):
                 stamp_ns = run.stamp_ns + round(_NS * (since_s or 0.0))
-                points, boxes = cloud.sweep(frame), boxes_at(run.tracks, frame)
+                points, boxes = cloud.sweep(frame), _boxes_at(run.tracks, frame)
                 sweeps.append(ShownSweep(frame, stamp_ns, np.array(T), points, boxes))
         shots = [_shot(run, name) for name in run.views]
         yield Timeline(run.key, T_world_key, cloud, sweeps, shots, run.tracks)
 
 
-def boxes_at(tracks: Sequence[ObjectTrack], frame: int) -> list[ShownBox]:
+def _boxes_at(tracks: Sequence[ObjectTrack], frame: int) -> list[ShownBox]:
     """Return the boxes of the objects at the time of a sweep."""
     boxes = []
     for track in tracks:
@@ -114,7 +114,7 @@ def _shot(run: FinishedRun, name: str) -> Shot:
 
 def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``recording.mcap``. Equal runs give equal bytes."""
-    foxglove = needed("foxglove", "mcap", "MCAP files")
+    foxglove = import_extra("foxglove", "mcap", "MCAP files")
     context, channels = foxglove.Context(), {}
     options = foxglove.mcap.MCAPWriteOptions(compression_threads=0)
     messages = _FoxgloveMessages(foxglove.messages)
@@ -249,14 +249,14 @@ def _ros_lens(camera: Camera) -> tuple[str, list[float]] | None:
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.rrd``. Bytes differ each time: rerun numbers its chunks by the clock."""
+    """Write ``recording.rrd``; the bytes differ each time, as rerun numbers chunks by the clock."""
     with _rerun_stream(runs) as stream:
         stream.save(folder / "recording.rrd")
         _log_to_rerun(stream, runs)
 
 
 def show_in_rerun(runs: Sequence[FinishedRun]) -> None:
-    """Show the runs in rerun's viewer, which stays open. Raise InputError as `write_rrd`."""
+    """Show the runs in rerun's viewer, which stays open; raise InputError without the package."""
     with _rerun_stream(runs) as stream:
         stream.spawn()
         _log_to_rerun(stream, runs)
@@ -265,7 +265,7 @@ def show_in_rerun(runs: Sequence[FinishedRun]) -> None:
 
 def _rerun_stream(runs: Sequence[FinishedRun]) -> Any:
     """Return a new recording of rerun."""
-    rr = needed("rerun", "rerun", "Recordings for rerun")
+    rr = import_extra("rerun", "rerun", "Recordings for rerun")
     name = f"key-{runs[0].key}-{runs[-1].key}"
     stream = rr.RecordingStream("densify", recording_id=name, send_properties=False)
     stream.set_log_time_enabled(False)
@@ -344,7 +344,7 @@ def _rerun_pose(T: Float) -> Any:
 
 def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
     """Show points and boxes, with a time line of several runs, until the window is closed."""
-    o3d, shown = needed("open3d", "open3d", "Windows with the cloud"), []
+    o3d, shown = import_extra("open3d", "open3d", "Windows with the cloud"), []
     for time, timeline in enumerate(timelines(runs)):
         cloud = timeline.cloud
         for group, keep in (("static", ~cloud.moving), ("moving", cloud.moving)):
@@ -354,7 +354,7 @@ def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
             geometry.transform(timeline.T_world_key)
             name = f"key {timeline.key}, {group}"
             shown.append({"name": name, "geometry": geometry, "group": group, "time": time})
-        for box in boxes_at(timeline.tracks, timeline.key):
+        for box in _boxes_at(timeline.tracks, timeline.key):
             T = timeline.T_world_key @ box.T_key_object
             geometry = o3d.geometry.OrientedBoundingBox(T[:3, 3], T[:3, :3], box.size_m)
             name = f"key {timeline.key}, object {box.instance}"
@@ -369,7 +369,7 @@ def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
 
 
 def write_mp4(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``video/CAMERA.mp4`` with a frame for each map, ascending in time."""
+    """Write ``video/CAMERA.mp4`` with a frame for each map, in the order of runs and images."""
     shots = [(run, name) for run in runs for name in run.cameras]
     (folder / "video").mkdir()
     for camera in dict.fromkeys(name.partition("/")[0] for _, name in shots):
@@ -391,7 +391,7 @@ def write_mp4(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 def _picture(run: FinishedRun, name: str) -> Picture:
     """Return an image above its filled depth, as (h,w,3) blue, green, red, and a black bar."""
-    depth = coloured(metres(run.maps(name)["depth_filled"]))
+    depth = colour_depth(metres(run.maps(name)["depth_filled"]))
     panels, jpeg = [depth], run.jpeg(name)
     if jpeg is not None:
         panels.insert(0, decode_image(jpeg, run.folder))

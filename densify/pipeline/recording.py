@@ -23,7 +23,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar, cast
 import numpy as np
 
 from densify.config import Config
-from densify.config.cache import Cache, code_digest, kept
+from densify.config.cache import Cache, code_digest, get_cached
 from densify.config.errors import InputError, SweepError, UnfitSweepError
 from densify.config.plugins import engine as engine_row
 from densify.depth.rays import Rays, complete_boxes
@@ -324,7 +324,7 @@ class Recording:
             self.sweeps.prepare(frames)
             sweeps, left_out = self._read_usable(frames)
             pieces = []
-            remaining = self.timeline.runs(sweeps)
+            remaining = self.timeline.split_at_holes(sweeps)
             while remaining:
                 run = remaining.pop()
                 try:
@@ -334,7 +334,7 @@ class Recording:
                     is_unfit = isinstance(error, UnfitSweepError)
                     left_out[error.frame] = LeftOut(str(error), unreadable=False, unfit=is_unfit)
                     others = [frame for frame in run if frame != error.frame]
-                    remaining += self.timeline.runs(others)
+                    remaining += self.timeline.split_at_holes(others)
             in_order = sorted(pieces, key=lambda piece: piece.frames)
             return Registration(tuple(in_order), left_out)
 
@@ -457,7 +457,7 @@ class Recording:
         # Processes of one run share the result. A digest would read every sweep of the road.
         shared = self._cache if self._run is not None else None
         inputs = [code_digest(), self._run, self.sequence.name, piece.number, piece.row]
-        return kept(shared, "far", lambda: inputs, make)
+        return get_cached(shared, "far", lambda: inputs, make)
 
     def _in_windows(self, number: int) -> frozenset[int]:
         """Return the frames of the windows of a block's keys."""
@@ -479,4 +479,4 @@ class Recording:
             period_ns = self.timeline.period_ns
             return [code_digest(), self.settings.register, period_ns, content, list(settings)]
 
-        return kept(self._cache, step, inputs, make)
+        return get_cached(self._cache, step, inputs, make)

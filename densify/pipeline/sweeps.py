@@ -9,7 +9,7 @@ from functools import lru_cache
 from uuid import uuid4
 
 from densify.config import RegisterSettings
-from densify.config.cache import Cache, digest, kept
+from densify.config.cache import Cache, digest, get_cached
 from densify.config.errors import InputError
 from densify.free_space.raw_sweeps import count_by_azimuth
 from densify.geometry.types import Float, Int, LidarSequence, Sweep
@@ -89,7 +89,7 @@ class Sweeps:
 
         # Processes of a run share the digest, so only one of them reads the sweep.
         inputs = [self._run, self._sequence.name, self._settings, frame]
-        return kept(self._cache, "digests", lambda: inputs, make_digest)
+        return get_cached(self._cache, "digests", lambda: inputs, make_digest)
 
 
 @dataclass(frozen=True)

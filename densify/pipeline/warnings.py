@@ -168,7 +168,7 @@ def _warn_of_recorded_poses(recording: Recording, key: int) -> Iterator[str]:
     row = timeline.row[key]
     num_beside = max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
     neighbours = timeline.frames[max(row - num_beside, 0) : row + num_beside + 1]
-    (run,) = (frames for frames in timeline.runs(neighbours) if key in frames)
+    (run,) = (frames for frames in timeline.split_at_holes(neighbours) if key in frames)
     settings = replace(recording.settings.register, source="kiss-icp")
     try:
         sweeps = [recording.sweeps.read(frame) for frame in run]

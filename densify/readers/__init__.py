@@ -23,10 +23,10 @@ _MOST_NAMED = 3  # most unusable sweeps that are listed with a reason
 
 
 class ReaderModule(Protocol):
-    """Interface of a reader's module."""
+    """Interface of a reader's module, which also has the ``recognises`` of `Plugin`."""
 
     def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
-        """Open a recording; ``scene`` is the text after ``#`` in ``--data``, None without it."""
+        """Return the recording at a path; ``scene`` is the text after ``#``, None without it."""
         ...
 
 
@@ -40,7 +40,11 @@ class Spec(NamedTuple):
 
     @staticmethod
     def parse(text: str | Path) -> Spec:
-        """Split a specification ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``."""
+        """Return the parts of a text ``street[:PRESET][?...]`` or ``[READER:]PATH[#SCENE]``.
+
+        A word before a colon is a reader only if a reader has this name. A ``#`` in the path of an
+        existing file is a part of the path.
+        """
         text = str(text)
         if text == "street" or text.startswith(("street:", "street?")):
             return Spec("street", text)
@@ -73,10 +77,14 @@ def _exists(location: str) -> bool:
 
 
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
-    """Open a recording; sweeps and images are read later, on demand.
+    """Return a recording; its sweeps and images are read later, on demand.
 
-    ``spec`` is a path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
-    built-in simulated street. Without ``READER:`` the reader is recognised by the files.
+    Args:
+        spec: A path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
+            built-in simulated street. Without ``READER:`` the reader is recognised by the files.
+
+    Raises:
+        InputError: No reader recognises the files, the scene is unknown, or files are damaged.
     """
     parsed = Spec.parse(spec)
     if parsed.reader == "street":
@@ -88,7 +96,7 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
         raise InputError(
             f"data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
         )
-    module = cast(ReaderModule, reader.work())
+    module = cast(ReaderModule, reader.load_module())
     sequence = module.open_recording(parsed.path, parsed.scene)
     if isinstance(sequence, FileSequence):
         sequence.check_first_images()
@@ -98,7 +106,7 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
 def _reader_of(parsed: Spec, where: str) -> Plugin:
     """Return the named reader, or the first reader that recognises the path."""
     if parsed.reader is not None:
-        return READERS.row(parsed.reader, where)
+        return READERS.plugin(parsed.reader, where)
     if not parsed.path.exists():
         name, _, _ = parsed.place.partition(":")
         hint = did_you_mean(name, [*READERS.names(), "street"])
@@ -144,18 +152,22 @@ def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
 
 
 def describe(sequence: LidarSequence) -> str:
-    """Return a summary of a recording as aligned lines of text: the pairs of `findings`."""
-    return in_lines(findings(sequence))
+    """Return a summary of a recording as lines of text, the pairs of `findings`."""
+    return align(findings(sequence))
 
 
-def in_lines(lines: Sequence[tuple[str, str]]) -> str:
-    """Return (name, text) pairs as lines in which all texts start in the same column."""
+def align(lines: Sequence[tuple[str, str]]) -> str:
+    """Return (name, text) pairs as lines of text; all texts start in the same column."""
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(f"{label:<{width}}{text}" for label, text in lines)
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Return a recording's summary as (name, text) pairs, by its first and last readable sweep."""
+    """Return a recording's summary as (name, text) pairs; raise InputError if no sweep is readable.
+
+    The pairs give frames, rate, stamps, points, cameras, poses, truth and the reader's findings.
+    Points and stamps are those of the first and the last readable sweep.
+    """
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)
     first = _readable(sequence, timeline.frames, unreadable)

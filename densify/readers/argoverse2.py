@@ -39,7 +39,7 @@ _FX_FY_CX_CY = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
-    """Open a log by its folder; or, with its name as ``scene``, by its split or the data set."""
+    """Return the log in a folder; or the log ``scene`` of a split's or the data set's folder."""
     if scene is None and (path / _TRACK).is_file():
         return Argoverse2(path)
     folders = (path, path / "train", path / "val", path / "test")
@@ -82,10 +82,10 @@ class Argoverse2(FileSequence):
             log,
             range(len(sweeps)),
             cameras,
-            {name: dict(enumerate(files)) for name, files in images.items()},
-            checks.truth_beside(log),
-            dict(enumerate(sweeps.values())),
-            {name: dict(enumerate(files.values())) for name, files in images.items()},
+            exposed_ns={name: dict(enumerate(files)) for name, files in images.items()},
+            truth=checks.truth_beside(log),
+            files=dict(enumerate(sweeps.values())),
+            images={name: dict(enumerate(files.values())) for name, files in images.items()},
         )
 
     def _returns(self, frame: int) -> Returns:
@@ -94,12 +94,12 @@ class Argoverse2(FileSequence):
         offset_ns = columns["offset_ns"].astype(np.int64)
         points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
         return Returns(
-            self._track.as_fired(points, self._stamps_ns[frame], offset_ns),
+            self._track.undo_compensation(points, self._stamps_ns[frame], offset_ns),
             (columns["intensity"] / 255.0).astype(np.float32),
             offset_ns,
-            columns["laser_number"].astype(np.int64) // LASERS_PER_SCANNER,
-            self._T_ego_scanner[:, :3, 3],
-            checks.scanner_axes(self._T_ego_scanner),
+            lidar=columns["laser_number"].astype(np.int64) // LASERS_PER_SCANNER,
+            scanner_origins=self._T_ego_scanner[:, :3, 3],
+            R_scanner_lidar=checks.scanner_axes(self._T_ego_scanner),
         )
 
     def _pose(self, frame: int) -> Float:

@@ -29,7 +29,9 @@ def numbered_files(
     """Return the numbered files of a folder, such as ``0000000120.bin``, by ascending number.
 
     Args:
+        folder: Folder to search without its subfolders, or one file. It may be missing.
         *suffixes: Accepted suffixes. Of files with the same number, the earliest suffix is taken.
+            Two files of one suffix with the same number raise InputError.
         stem: Pattern of a whole name without suffix; its first group is the number.
     """
     entries = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
@@ -65,8 +67,8 @@ def drive_around(path: Path) -> Path | None:
     return next((parent for parent in parents if (parent / "velodyne_points").is_dir()), None)
 
 
-def of_frame(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
-    """Return the entry of a frame; the error for a missing one names ``where`` and ``kind``."""
+def find_entry(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
+    """Return the entry of a frame; without it, an InputError names ``where`` and ``kind``."""
     if frame not in entries:
         raise InputError(
             f"{where}: no {kind} of frame {frame}; frames that exist: {format_frames(entries)}"
@@ -83,15 +85,15 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
     return cameras[name]
 
 
-def decoded_image(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
-    """Decode an image file's bytes to (H,W,3) uint8 RGB; a gray image has three equal channels."""
+def decode_rgb(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
+    """Return an image file's bytes as (H,W,3) uint8 RGB; raise InputError if of another size."""
     bgr = decode_image(data, where)
     check_image_size(bgr.shape, camera, where)
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
 
 
 def check_image_size(shape: tuple[int, ...], camera: Camera, where: Path | str) -> None:
-    """Raise InputError if an image's shape (H,W,...) differs from the size of its camera."""
+    """Raise InputError if an image's shape (H,W,...) differs from its camera's height and width."""
     if shape[:2] != (camera.height_px, camera.width_px):
         raise InputError(
             f"{where}: got an image of {shape[1]} x {shape[0]} px; expected {camera.width_px} x "
@@ -108,7 +110,11 @@ def pinhole(
     where: str,
     **lens: Any,
 ) -> Camera:
-    """Return a camera with zero skew, after checks; ``lens`` has further arguments of `Camera`."""
+    """Return a camera with zero skew; ``lens`` has further arguments of `Camera`.
+
+    Raise InputError, whose message begins with ``where``, unless the focal lengths and sizes are
+    above 0.
+    """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
         raise InputError(
@@ -122,9 +128,11 @@ def pinhole(
 def chosen_scene(
     reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
 ) -> str:
-    """Return the name of the requested scene; for None, the name of the only scene.
+    """Return the name of the requested or only scene; raise InputError if it is not clear.
 
     Args:
+        reader, path: Name of the reader and path of the recordings, for messages.
+        scene: Name of the requested scene; None for the only scene.
         names: Names of the existing scenes.
         none: Message of the InputError if there are no scenes.
     """
@@ -147,7 +155,7 @@ def truth_beside(recording: Path) -> Truth | None:
 
 
 def parse_numbers(text: str, where: str, count: int) -> Float:
-    """Parse a text of numbers separated by white space; return them as (count,)."""
+    """Return a text of ``count`` finite numbers as (count,); raise InputError for others."""
     try:
         values = np.array(text.split(), np.float64)
     except ValueError as error:
@@ -159,8 +167,12 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
     return values
 
 
-def rigid(T: Any, where: str) -> Float:
-    """Return a (4,4) rigid transform, checked, from (4,4), (3,4), or 16 or 12 numbers."""
+def pose(T: Any, where: str) -> Float:
+    """Return a (4,4) rigid transform from (4,4), (3,4), or 16 or 12 numbers, row by row.
+
+    Raise InputError, whose message begins with ``where``, if a number is not finite, or the
+    rotation is mirrored or not orthonormal to 0.001.
+    """
     T = np.asarray(T, np.float64)
     T = T.reshape(-1, 4) if T.size in (12, 16) else T
     if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
@@ -177,7 +189,7 @@ def rigid(T: Any, where: str) -> Float:
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """Return (S,3,3) rotations from the lidar frame to scanner axes, of (S,4,4) mounting poses."""
+    """Return (S,3,3) rotations from lidar axes to scanner axes, of mounting poses (S,4,4)."""
     R = T_lidar_scanner[:, :3, :3]
     # The axes of a scanner mounted upside down are turned by 180 degrees about x, so that z is up.
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
@@ -187,7 +199,11 @@ def scanner_axes(T_lidar_scanner: Float) -> Float:
 def quaternion_pose(
     w_x_y_z: Sequence[float] | Float, translation_m: Sequence[float] | Float, where: str
 ) -> Float:
-    """Return the (4,4) pose of a unit quaternion, scalar first, and a translation in metres."""
+    """Return the (4,4) pose of a unit quaternion, scalar first, and a translation in metres.
+
+    Raise InputError, whose message begins with ``where``, for other than 4 and 3 finite numbers, or
+    a quaternion whose length is more than 0.01 from 1.
+    """
     from scipy.spatial.transform import Rotation
 
     try:
@@ -209,7 +225,7 @@ def quaternion_pose(
 
 
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
-    """Return (K,4,4) poses at centres (K,3), turned about z by (K,) headings from x towards y."""
+    """Return (K,4,4) poses at centres (K,3) m, turned about z by headings (K,) rad from x to y."""
     T = np.tile(np.eye(4), (len(centre_m), 1, 1))
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     T[:, 0, 0] = cosine
@@ -227,7 +243,19 @@ def boxes(
     where: str,
     lidar: Int | None = None,
 ) -> Boxes:
-    """Return the K boxes of a sweep after checks; `Boxes` describes the arguments."""
+    """Return the K annotated boxes of a sweep.
+
+    Args:
+        track: (K,) name of each object in all sweeps, "" for an untracked object.
+        T_lidar_box: (K,4,4) poses of the boxes: origin in the middle, x to the front, z up.
+        size_m: (K,3) length, width and height.
+        where: File, with which messages begin.
+        lidar: (K,) index of the scanner whose points a box encloses, -1 for all scanners; None if
+            every box encloses the points of all scanners.
+
+    Raises:
+        InputError: A size is not above 0, a pose is not finite, or a name occurs twice.
+    """
     wrong_rows = np.flatnonzero(~((size_m > 0) & (size_m < np.inf)).all(axis=1))
     if len(wrong_rows):
         raise InputError(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import gunzipped, needed, open_file, read_bytes, reason
+from densify.config.file_content import gunzip, import_extra, open_file, read_bytes, reason
 
 # Letter of a kind -> words for messages, and kinds of NumPy types (a text) or names of Arrow types
 _KINDS = {
@@ -42,16 +42,19 @@ def read_arrow(
 
     Args:
         path: File whose suffix is .feather or .parquet.
-        columns: Name of a column -> its kind: "n" finite numbers, "m" numbers or NaN, "i"
-            integers, "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of
-            arrays or None).
+        columns: Name of a column -> its kind: "n" finite numbers, "m" numbers or NaN, "i" integers,
+            "s" strings, "b" bytes, "t" booleans, "l" lists of numbers (an object array of arrays or
+            None).
         data_set: Extra that installs pyarrow, and the name of the recordings for messages.
         where: Name of a column -> value that the rows to read have there, for a parquet file; None
             for all rows.
+
+    Raises:
+        InputError: The file is missing or damaged, or a column is missing or of another kind.
     """
-    needed("pyarrow", *data_set)
+    import_extra("pyarrow", *data_set)
     is_feather = path.suffix == ".feather"
-    library = needed("pyarrow.feather" if is_feather else "pyarrow.parquet", *data_set)
+    library = import_extra("pyarrow.feather" if is_feather else "pyarrow.parquet", *data_set)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected the columns {', '.join(columns)} in it")
     open_file(path).close()  # raises a clearer error if the file cannot be opened
@@ -153,11 +156,12 @@ class _Unpickler(pickle._Unpickler):
 def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
     """Return the columns (N,) of a gzipped, pickled pandas data frame, by name; no code is run.
 
-    A column of texts holds Python objects, whose type the caller must check.
+    A column of texts holds Python objects, whose type the caller must check. Raise InputError if
+    the file is no such data frame.
     """
     data = read_bytes(path)
     try:
-        return _pickled_columns(_Unpickler(io.BytesIO(gunzipped(data, path))).load())
+        return _pickled_columns(_Unpickler(io.BytesIO(gunzip(data, path))).load())
     except Exception as error:  # a damaged file can raise any type
         raise InputError(
             f"{path}: not a gzipped pandas data frame of numbers and texts ({reason(error)}); "

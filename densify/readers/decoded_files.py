@@ -56,7 +56,7 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return arrays of a .npz by name, ``most_bytes`` together at most; ``names`` None for all."""
+    """Return arrays of a .npz by name, all for None; raise InputError if over ``most_bytes``."""
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -100,9 +100,10 @@ def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
 
 
 def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDArray[Any]:
-    """Decode PNG or JPEG bytes to (H,W,3) uint8 pixels in blue, green, red.
+    """Return the (H,W,3) uint8 pixels of PNG or JPEG bytes as blue, green, red.
 
-    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16.
+    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16. Raise InputError,
+    whose message begins with ``where``, for damaged bytes.
     """
     import cv2
     from PIL import Image
@@ -139,13 +140,13 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return the width and height (px) of an image file after decoding all pixels."""
+    """Return the width and height (px) of an image file; raise InputError if it is damaged."""
     height, width = read_image(path).shape[:2]
     return width, height
 
 
 def stated_size_px(path: Path) -> tuple[int, int] | None:
-    """Return the width and height (px) that an image's header states, None without a header."""
+    """Return the width and height (px) that an image's header states; None if unreadable."""
     from PIL import Image
 
     try:
@@ -156,7 +157,7 @@ def stated_size_px(path: Path) -> tuple[int, int] | None:
 
 
 def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
-    """Raise InputError if an image (width, height) is empty or exceeds `MOST_PIXELS`."""
+    """Raise InputError if an image (width, height) is empty or has over `MOST_PIXELS` pixels."""
     width, height = size_px
     if min(size_px) < 1 or width * height > MOST_PIXELS:
         raise InputError(
@@ -166,7 +167,7 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
 
 
 def decode_jpeg(data: bytes) -> tuple[NDArray[np.uint8], str]:
-    """Return a JPEG file's (H,W,3) pixels in blue, green, red, and its repairs, "" for none."""
+    """Return a JPEG's (H,W,3) BGR pixels and repairs, "" for none; ValueError if damaged."""
     pixels, complaint = _decoded_strictly(data)
     repairs = []
     if complaint.startswith(_NO_END):
@@ -239,7 +240,7 @@ def _ends_in_ones(data: bytes, end: int) -> bool:
 
 
 def read_las(path: Path) -> Any:
-    """Read all points of a LAS or LAZ file as a `laspy.LasData`; raise InputError if damaged."""
+    """Return all points of a LAS or LAZ file as `laspy.LasData`; raise InputError if damaged."""
     import laspy
 
     data = read_bytes(path)

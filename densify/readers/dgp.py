@@ -31,7 +31,7 @@ _BOGUS_YEAR = 2200  # DDAD stores tenths of microseconds as microseconds
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
-    """Open a scene by its folder, or by a folder of scenes with the scene's name."""
+    """Return the scene in a folder; or the scene of this name in a folder of scenes."""
     if scene is None and _scene_files(path):
         return Dgp(path)
     names = sorted(folder.name for folder in path.glob("*/") if _scene_files(folder))
@@ -93,13 +93,13 @@ class Dgp(FileSequence):
             path,
             tuple(self._sweeps),
             cameras,
-            {
+            exposed_ns={
                 name: {number: datum.stamp_ns for number, datum in data.items()}
                 for name, data in self._images.items()
             },
-            checks.truth_beside(path),
-            {number: sweep.path for number, sweep in self._sweeps.items()},
-            {
+            truth=checks.truth_beside(path),
+            files={number: sweep.path for number, sweep in self._sweeps.items()},
+            images={
                 name: {number: datum.path for number, datum in data.items()}
                 for name, data in self._images.items()
             },
@@ -157,8 +157,8 @@ def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
         checks.file_within(file.parent, datum["filename"], where),
         _stamp_ns(entry["id"]["timestamp"]),
         _read_pose(datum["pose"], where),
-        tuple(datum.get("point_format", ())),
-        (int(datum.get("width", 0)), int(datum.get("height", 0))),
+        columns=tuple(datum.get("point_format", ())),
+        size_px=(int(datum.get("width", 0)), int(datum.get("height", 0))),
     )
 
 

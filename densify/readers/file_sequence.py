@@ -55,7 +55,7 @@ class FileSequence(ABC):
         # PNG or JPEG files by camera and number; a reader without them overrides `_image`
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
-        """Store the files and times that the reader found."""
+        """Store what the reader found; raise InputError if all files of sweeps are empty."""
         self.name = name
         self.where = where
         self.frames: Sequence[int] = frames
@@ -74,7 +74,7 @@ class FileSequence(ABC):
         return in_one_line(self)
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep without reading its points."""
+        """Return the reference time of a sweep in nanoseconds, without reading its points."""
         self.check_frame(frame)
         return int(self._stamps_ns[frame])
 
@@ -104,19 +104,20 @@ class FileSequence(ABC):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         """Return an existing image, (H,W,3) uint8 RGB."""
         path = self._image_files[camera.name][number]
-        return checks.decoded_image(read_bytes(path), camera, path)
+        return checks.decode_rgb(read_bytes(path), camera, path)
 
     def _pose(self, frame: int) -> Float:
-        """Return the (4,4) T_world_lidar of an existing sweep; InputError without poses."""
+        """Return the (4,4) T_world_lidar of an existing sweep; raise InputError without poses."""
         raise InputError(
             f"{self.where}: no poses; let the sweeps register themselves with "
             f"--set register.source=kiss-icp"
         )
 
     def __getitem__(self, frame: int) -> Sweep:
-        """Read a sweep and return its valid points, in file order, at their own firing times.
+        """Return the valid points of a sweep, in file order, at their own firing times.
 
         Rows at 0 0 0 (padding) or not finite are dropped; intensities that are not finite become 0.
+        Raise InputError if the sweep is missing, malformed or without valid points.
         """
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower
@@ -157,28 +158,28 @@ class FileSequence(ABC):
         return len(self._checked_returns(frame)[1].points)
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return the exposure time of each existing image of a camera, by image number."""
+        """Return the exposure time (ns) of each existing image of a camera, by image number."""
         checks.camera_named(self.cameras, camera, self.where)
         return self._exposed_ns.get(camera, {})
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Read an image as (H,W,3) RGB; raise InputError if it is missing or of another size."""
+        """Return an image as (H,W,3) uint8 RGB; InputError if it is missing or of another size."""
         return self._image(self.check_image(camera, number), number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the recorded (4,4) pose of the lidar in the world at a sweep's reference time."""
+        """Return the recorded (4,4) lidar pose at a sweep's stamp; InputError without poses."""
         self.check_frame(frame)
-        return checks.rigid(self._pose(frame), f"{self.where}: pose of frame {frame}")
+        return checks.pose(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
     def check_frame(self, frame: int) -> None:
         """Raise InputError, with the existing frame numbers, if the sweep does not exist."""
         if frame not in self._frames:
-            checks.of_frame(dict.fromkeys(self.frames), frame, "sweep", self.where)
+            checks.find_entry(dict.fromkeys(self.frames), frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
         """Return the camera of an image; raise InputError if the image does not exist."""
         calibrated = checks.camera_named(self.cameras, camera, self.where)
-        checks.of_frame(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
+        checks.find_entry(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated
 
 

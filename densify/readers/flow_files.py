@@ -49,7 +49,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion of all points from a folder's flow files: the engine ``npz:FOLDER``."""
+    """Return the motion by a folder's flow files (engine ``npz:FOLDER``); InputError without it."""
     check_argument(argument)
     step = partial(read_step, Path(argument), scene.stretch)
     return ChainedMotion(scene.stretch, step)
@@ -62,7 +62,11 @@ def check_argument(argument: str) -> None:
 
 
 def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowField:
-    """Read a sweep's flow to another, ego-motion removed, lidar frame; 0 for missing points."""
+    """Return the flow of a sweep to another, ego-motion removed, lidar frame.
+
+    ``source`` and ``target`` are indices in ``stretch``. A point that the file lacks is static.
+    Raise InputError if the file is missing or malformed.
+    """
     columns = _step_columns(folder, stretch, stretch.frames[source], stretch.frames[target])
     residual = columns["residual_flow"]
     moving = columns["moving"].astype(bool)
@@ -111,7 +115,7 @@ def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Co
 
 
 def load_flow_file(path: Path) -> Columns:
-    """Return the arrays of a flow file by name, as stored."""
+    """Return the arrays of a flow file by name, as stored; InputError if missing or malformed."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     arrays = read_arrays(path, _KNOWN)
@@ -174,8 +178,15 @@ class LabelledFlow:
     valid: Bool  # (N,) bool, the ground-truth flow of the point is known
 
 
-def labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
-    """Read the ground-truth flow of a sweep to the next sweep of the stretch."""
+def read_labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
+    """Return a sweep's ground-truth flow to the next sweep; raise InputError if it is missing.
+
+    Args:
+        folder: Folder of flow files or of Argoverse 2 labels.
+        name: Name of the recording, which may be the name of a subfolder.
+        stretch: Registered sweeps.
+        frame: Frame number of the sweep.
+    """
     if not folder.is_dir():
         raise InputError(f"--truth {folder}: no such folder; expected true flow in it")
     if any(folder.glob("*_*.npz")):

@@ -32,8 +32,8 @@ from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.folder_config import NAME, CameraFiles, FolderConfig, SweepFiles
 from densify.readers.point_fields import Columns, PointLayout, PointTimes, sample_columns
 from densify.readers.point_files import SUFFIXES, read_table
-from densify.readers.recorded_poses import PoseFile, PoseTrack, taken_back
-from densify.readers.stamped_files import NamedFile, Series, existing, files_below, in_time
+from densify.readers.recorded_poses import PoseFile, PoseTrack, transform_from_world
+from densify.readers.stamped_files import NamedFile, Series, files_below, order_files, require_path
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _SEARCH_DEPTH = 2  # levels of subfolders
@@ -53,7 +53,7 @@ class SweepColumns:
     _point_stamps_ns: dict[int, int] = field(default_factory=dict)
 
     def returns(self, frame: int, stamp_ns: int) -> Returns:
-        """Read all rows of a sweep, in the lidar frame, by its frame number and reference time."""
+        """Return all rows of a sweep in the lidar frame; ``stamp_ns`` is its reference time."""
         path = self.series.paths[frame]
         columns = self._columns(path)
         returns, valid = self.layout.returns(columns, path, stamp_ns)
@@ -86,9 +86,9 @@ class SweepColumns:
             [*self._samples.values()],
             path,
             self.period_ns,
-            None if stamps_ns is None else [stamps_ns[frame] for frame in self._samples],
-            named,
-            settings.intensity_scale,
+            stamps_ns=None if stamps_ns is None else [stamps_ns[f] for f in self._samples],
+            named=named,
+            intensity_scale=settings.intensity_scale,
             unit=settings.time_unit,
             absolute=settings.time_is == "absolute" if settings.time_is else None,
             reference=settings.reference,
@@ -140,14 +140,14 @@ class SweepColumns:
 
     @cached_property
     def period_ns(self) -> int:
-        """The median time between consecutive stamps, or the period of the rate without stamps."""
+        """The median time between stamps in ns; without stamps, the period of the assumed rate."""
         stamps_ns = list((self.series.stamps_ns or {}).values())
         if len(stamps_ns) > 1:
             return max(1, int(np.median(np.diff(stamps_ns))))
         return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
 
-    def fields(self) -> str:
-        """Describe the columns in use, and the unused ones with the range of their values."""
+    def describe_columns(self) -> str:
+        """Return a text of the columns in use, and of the unused ones with ranges of values."""
         used = {quantity: name for quantity, name in vars(self.layout.fields).items() if name}
         unused = [
             f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
@@ -184,7 +184,7 @@ class SweepColumns:
 
 
 def open_recording(path: Path, scene: str | None) -> Folder:
-    """Open a folder of sweeps; ``scene`` is unused, since a folder has no scenes."""
+    """Return a folder of sweeps; ``scene`` is not used."""
     return Folder(path)
 
 
@@ -196,7 +196,7 @@ class Folder(FileSequence):
         self._config = FolderConfig.read(folder)
         settings, cameras = self._config.sweeps, self._config.cameras
         files = _find_sweeps(folder, settings.files)
-        sweeps = in_time(folder, files, settings.stamps, settings.stamps_unit)
+        sweeps = order_files(folder, files, settings.stamps, settings.stamps_unit)
         self._columns = SweepColumns(sweeps, settings, self._config.path)
         images = {name: _find_images(folder, name, files) for name, files in cameras.items()}
         super().__init__(
@@ -231,12 +231,12 @@ class Folder(FileSequence):
         return text
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep."""
+        """Return the reference time of a sweep in nanoseconds."""
         self.check_frame(frame)
         return self._columns.stamp_ns(int(frame))
 
     def gaps(self) -> list[str]:
-        """Return missing parts of the recording and what is assumed instead, a sentence each."""
+        """Return a sentence for each missing part, which says what is assumed instead."""
         notes, drive = self._columns.assumed(), checks.drive_around(self.where)
         if drive is not None:
             notes.append(
@@ -252,7 +252,7 @@ class Folder(FileSequence):
         layout, first = self._columns.layout, self._files[self.frames[0]]
         lines = [
             ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
-            ("fields", self._columns.fields()),
+            ("fields", self._columns.describe_columns()),
             ("intensity", f"divided by {layout.intensity_scale:g}"),
             ("times", _UNTIMED if self._is_untimed else layout.time_words),
             ("stamped by", self._columns.stamped_by),
@@ -272,21 +272,21 @@ class Folder(FileSequence):
         returns = self._columns.returns(frame, stamp_ns)
         if self._config.sweeps.frame == "poses":
             if self._track is not None:
-                return self._track.taken_back(returns, stamp_ns)
-            points = taken_back(returns.points, self._pose(frame))
+                return self._track.undo_placement(returns, stamp_ns)
+            points = transform_from_world(returns.points, self._pose(frame))
             return replace(returns, points=points, offset_ns=None)  # compensated to the pose
         if not self._config.sweeps.compensated or returns.offset_ns is None:
             return returns
         if self._track is None:  # _is_untimed
             return replace(returns, offset_ns=None)
-        points = self._track.as_fired(returns.points, stamp_ns, returns.offset_ns)
+        points = self._track.undo_compensation(returns.points, stamp_ns, returns.offset_ns)
         return replace(returns, points=points)
 
     def _pose(self, frame: int) -> Float:
         if self._track is not None:
             return self._track.at(self.stamp_ns(frame))
         if self._poses is not None:
-            return checks.of_frame(self._T_world_lidar, frame, "pose", self._poses.path)
+            return checks.find_entry(self._T_world_lidar, frame, "pose", self._poses.path)
         return super()._pose(frame)
 
     def _read_poses(self) -> None:
@@ -313,7 +313,7 @@ class Folder(FileSequence):
 def _find_sweeps(folder: Path, files: str) -> list[Path]:
     """Return the numbered point files in ``files`` ("": two levels deep), all of one suffix."""
     if files:
-        existing(folder, files, "sweeps: {files: ...}", is_folder=True)
+        require_path(folder, files, "sweeps: {files: ...}", is_folder=True)
     below = files_below(folder / files, SUFFIXES, 0 if files else _SEARCH_DEPTH)
     numbered = {
         name: [path for path in paths if _is_numbered(path)] for name, paths in below.items()
@@ -350,4 +350,4 @@ def _find_images(folder: Path, name: str, config: CameraFiles) -> Series:
         key = f"cameras: {{{name}: {{files: {config.files}}}}}"
         raise InputError(f"{folder / config.files}: no images, though densify.yaml names it: {key}")
     (paths,) = below.values()
-    return in_time(folder, paths, config.stamps, config.stamps_unit, shared=False)
+    return order_files(folder, paths, config.stamps, config.stamps_unit, shared=False)

@@ -26,7 +26,7 @@ C = TypeVar("C")
 
 
 class Kind(NamedTuple):
-    """A kind of values."""
+    """A kind of values: a function that converts them, and their description."""
 
     # Converts the value in the YAML; raises an exception, such as ValueError, for a wrong one
     convert: Callable[[Any], Any]
@@ -97,7 +97,7 @@ _NUMBER = Kind(lambda value: float(_array(value)), "a finite number")
 _ABOVE_0 = Kind(_above_0, "a finite number above 0")
 _UNIT = _one_of(UNIT_NS)
 _MOTION = Kind(
-    lambda value: checks.rigid(_array(value, -1, 4), ""),
+    lambda value: checks.pose(_array(value, -1, 4), ""),
     "three or four rows of a rotation and translation",
 )
 _POINTS = Kind(lambda value: _array(value, -1, 3), "finite numbers of shape (N, 3)")
@@ -166,7 +166,7 @@ class CameraFiles:
     clock_offset_s: float = _NUMBER.key(0.0)
 
     def camera(self, name: str) -> Camera:
-        """Return the camera of this calibration."""
+        """Return the camera of this calibration with the given name."""
         width_px, height_px = self.size
         is_bent = self.model != "pinhole" or any(self.distortion)
         return Camera(
@@ -193,7 +193,7 @@ class FolderConfig:
 
     @staticmethod
     def read(folder: Path) -> FolderConfig:
-        """Read the densify.yaml of a folder; return the defaults if the folder has none."""
+        """Return a folder's densify.yaml, the defaults without one; InputError if malformed."""
         path = folder / NAME
         if not path.is_file():
             return FolderConfig()

@@ -77,7 +77,7 @@ _IMAGES_360 = {
 
 
 def open_recording(path: Path, scene: str | None) -> Drive:
-    """Open a drive or sequence; ``scene`` names one of several in a folder."""
+    """Return the drive or sequence at a path; ``scene`` names one of several in a folder."""
     if (path / "velodyne_points").is_dir():
         return KittiRaw(path)
     if (path / "data_3d_raw").is_dir():
@@ -108,7 +108,7 @@ class Drive(FileSequence):
     def __init__(
         self, name: str, where: Path, sweeps: Path, stamps: Stamps, images: Mapping[str, Path]
     ) -> None:
-        """Find the .bin files in the folder ``sweeps``, and images in a folder of each camera."""
+        """Find .bin files in the folder ``sweeps``, and images in ``images`` (camera -> folder)."""
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
@@ -122,12 +122,12 @@ class Drive(FileSequence):
         self._exposed_ns = {camera: stamps.of(numbers) for camera, numbers in numbered.items()}
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep; raise InputError if the frame has no stamp."""
+        """Return the reference time of a sweep (ns); raise InputError if the frame has no stamp."""
         self.check_frame(frame)
         return self._stamps.at(frame)
 
     def gaps(self) -> list[str]:
-        """Return missing files and what is assumed instead, a sentence each."""
+        """Return a sentence for each missing file, which says what is assumed instead."""
         note = f"{self.where} has no {self._stamps.path.name}: sweeps are taken for 100 ms apart"
         return [] if self._stamps.by_frame else [note]
 
@@ -183,7 +183,7 @@ class KittiRaw(Drive):
         self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
 
     def gaps(self) -> list[str]:
-        """Return missing files and what is assumed instead, a sentence each."""
+        """Return a sentence for each missing file, which says what is assumed instead."""
         velodyne = self.where / "velodyne_points"
         notes = [f"{velodyne} has no {', '.join(self._missing)}"] * bool(self._missing)
         notes += super().gaps()
@@ -211,7 +211,7 @@ class KittiRaw(Drive):
         # The frame's own record is up to 20 ms away from the sweep, which is 0.3 m at 15 m/s.
         if not self._oxts:
             return super()._pose(frame)
-        checks.of_frame(self._oxts, frame, "oxts record", self.where)
+        checks.find_entry(self._oxts, frame, "oxts record", self.where)
         T_imu_lidar = poses.inverse(self._T_lidar_imu)
         recorded_ns = self._oxts_stamps.by_frame
         frames = [f for f in (frame - 1, frame, frame + 1) if f in recorded_ns and f in self._oxts]
@@ -300,7 +300,7 @@ class KittiOdometry(Drive):
         points = stored
         for _ in range(_NUM_ROUNDS):
             offset_ns = turned_ns(points, self._stamps.period_ns)
-            points = self._track.as_fired(stored, self.stamp_ns(frame), offset_ns)
+            points = self._track.undo_compensation(stored, self.stamp_ns(frame), offset_ns)
         return Returns(points, intensity, offset_ns)
 
     def _pose(self, frame: int) -> Float:
@@ -355,13 +355,13 @@ class KittiTracking(Drive):
             return super()._pose(frame)
         lines = dict(enumerate(read_text(path).splitlines()))
         first, record = (
-            parse_oxts(checks.of_frame(lines, f, "oxts record", path), f"{path}: line {f + 1}")
+            parse_oxts(checks.find_entry(lines, f, "oxts record", path), f"{path}: line {f + 1}")
             for f in (0, frame)
         )
         return T_first_imu(first, record) @ poses.inverse(self._calibration.motion("Tr_imu_velo"))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes (at ``offset_ns``) in the lidar frame; None without labels."""
+        """Return a sweep's boxes at their firing times, in the lidar frame; None without labels."""
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
         if not path.is_file():
@@ -429,7 +429,7 @@ class Kitti360(Drive):
             where = f"{self._pose_file}: line {number}"
             frame, *numbers = checks.parse_numbers(line, where, 13).tolist()
             if frame in self._stamps.by_frame:
-                T_world_pose[self._stamps.by_frame[int(frame)]] = checks.rigid(numbers, where)
+                T_world_pose[self._stamps.by_frame[int(frame)]] = checks.pose(numbers, where)
         stamps_ns = np.array(list(T_world_pose), np.int64)
         T = np.reshape(list(T_world_pose.values()), (-1, 4, 4))
         return PoseTrack(str(self._pose_file), stamps_ns, T)
@@ -443,7 +443,7 @@ class Kitti360(Drive):
         """The (4,4) pose of the scanner in the vehicle's frame, computed through camera 0."""
         path = self.where / "calibration" / "calib_cam_to_velo.txt"
         where = f"{path}: the transform from camera 0 to the scanner"
-        T_lidar_cam = checks.rigid(checks.parse_numbers(read_text(path), where, 12), where)
+        T_lidar_cam = checks.pose(checks.parse_numbers(read_text(path), where, 12), where)
         return self._to_pose.motion("image_00") @ poses.inverse(T_lidar_cam)
 
     def _camera(self, name: str) -> Camera:

@@ -28,7 +28,10 @@ _HALF_VIEW_DEG = 90.0  # of a fisheye
 
 
 def read_points(path: Path) -> tuple[Float, np.ndarray]:
-    """Read (N,3) points (m, lidar frame, 0 0 0 if not finite) and (N,) reflectances (0 to 1)."""
+    """Return a sweep file's (N,3) points (m, lidar frame) and (N,) reflectances (0 to 1).
+
+    A point that is not finite becomes 0 0 0. Raise InputError if the file is cut off.
+    """
     data = read_bytes(path)
     if len(data) % 16:
         raise InputError(
@@ -41,7 +44,11 @@ def read_points(path: Path) -> tuple[Float, np.ndarray]:
 
 
 def turned_ns(points: Float, revolution_ns: int) -> Int:
-    """Return (N,) int64 firing times of points, not deskewed, since the scanner faced forward."""
+    """Return (N,) int64 ns from facing forward to the firing at each point, clockwise.
+
+    The times are from minus half to plus half of ``revolution_ns``, the duration of a revolution.
+    ``points`` (N,3) are in the lidar frame and not deskewed.
+    """
     # -0.5 to 0.5: firing times of the first half are negative
     revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return np.rint(revolution * revolution_ns).astype(np.int64)
@@ -58,22 +65,26 @@ class Stamps:
         """Return the time (ns) of a frame; raise InputError if the file has no time of it."""
         if not self.by_frame:
             return frame * NOMINAL_PERIOD_NS
-        return checks.of_frame(self.by_frame, frame, "stamp", self.path)
+        return checks.find_entry(self.by_frame, frame, "stamp", self.path)
 
     def of(self, frames: Mapping[int, Path]) -> dict[int, int]:
-        """Return the times (ns) of those of the given frames that have one, by frame."""
+        """Return frame -> time (ns) for those of the given frames that have a time."""
         known = self.by_frame or frames
         return {frame: self.at(frame) for frame in frames if frame in known}
 
     @property
     def period_ns(self) -> int:
-        """Median time between consecutive stamps; 100 ms for fewer than two."""
+        """Median time between consecutive stamps in nanoseconds; 100 ms for fewer than two."""
         steps_ns = np.diff(list(self.by_frame.values()))
         return int(np.median(steps_ns)) if len(steps_ns) else NOMINAL_PERIOD_NS
 
 
 def read_stamps(path: Path, required: bool = True) -> Stamps:
-    """Read the dates (UTC), a line for each frame; none for a missing file not required."""
+    """Return the stamps of a file with a date (UTC) on line k for frame k.
+
+    Other lines give no stamp; InputError if no line has one. A missing file has no stamps, or
+    raises InputError if ``required``.
+    """
     if not required and not path.exists():
         return Stamps(path, {})
     lines = [line.strip() for line in read_text(path).splitlines()]
@@ -93,7 +104,7 @@ def read_stamps(path: Path, required: bool = True) -> Stamps:
 
 
 def parse_oxts(text: str, where: str) -> Float:
-    """Return (30,): first latitude, longitude (deg), altitude (m), roll, pitch and yaw (rad)."""
+    """Return (30,) numbers: latitude, longitude (deg), altitude (m), roll, pitch, yaw (rad), ..."""
     values = checks.parse_numbers(text, where, 30)
     if abs(values[0]) >= 90:
         raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
@@ -101,7 +112,7 @@ def parse_oxts(text: str, where: str) -> Float:
 
 
 def T_first_imu(first: Float, record: Float) -> Float:
-    """Return a record's (4,4) pose of the GPS/IMU unit relative to the drive's first record."""
+    """Return the (4,4) GPS/IMU pose at the oxts numbers ``record`` in its frame at ``first``."""
     return poses.inverse(_T_mercator_imu(first, first)) @ _T_mercator_imu(record, first)
 
 
@@ -120,14 +131,14 @@ def _T_mercator_imu(oxts: Float, first: Float) -> Float:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A file of lines ``KEY: numbers``, colon optional; bad entries raise InputError on request."""
+    """A file of lines ``KEY: numbers``, colon optional. A malformed entry raises InputError."""
 
     path: Path
-    entries: Mapping[str, str]
+    entries: Mapping[str, str]  # key -> text of the numbers
 
     @staticmethod
     def read(path: Path) -> Calibration:
-        """Read a calibration file; raise InputError if the file is missing."""
+        """Return the entries of a calibration file; raise InputError if it is missing."""
         if not path.is_file():
             raise InputError(
                 f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
@@ -144,19 +155,23 @@ class Calibration:
 
     def motion(self, key: str) -> Float:
         """Return the (4,4) transform of an entry of twelve numbers, its upper three rows."""
-        return checks.rigid(self.numbers(key, 3, 4), f"{self.path}: {key}")
+        return checks.pose(self.numbers(key, 3, 4), f"{self.path}: {key}")
 
     def rotation(self, key: str, translation: str = "") -> Float:
-        """Return the (4,4) transform of an entry's rotation (3,3) and a named translation (m)."""
+        """Return the (4,4) transform of a rotation and an entry ``translation`` (m), "" for 0."""
         t = self.numbers(translation, 3, 1) if translation else np.zeros((3, 1))
-        return checks.rigid(np.hstack([self.numbers(key, 3, 3), t]), f"{self.path}: {key}")
+        return checks.pose(np.hstack([self.numbers(key, 3, 3), t]), f"{self.path}: {key}")
 
     def rectified_camera(
         self, key: str, name: str, size_px: tuple[int, int] | str, T_rect_lidar: Float
     ) -> Camera:
         """Return the rectified camera of an entry with a projection matrix P = K [I | t].
 
-        ``size_px`` is (width, height) or its entry; ``T_rect_lidar`` leads to rectified camera 0.
+        Args:
+            key: Name of the entry.
+            name: Name of the camera.
+            size_px: Width and height of its images, or the name of the entry that has them.
+            T_rect_lidar: (4,4) pose of the lidar in the frame of rectified camera 0.
         """
         P = self.numbers(key, 3, 4)
         if isinstance(size_px, str):
@@ -170,7 +185,8 @@ class Calibration:
 
 
 def read_fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
-    """Read a fisheye camera from OpenCV's YAML, whose first line YAML libraries reject."""
+    """Return the fisheye camera (Mei's model) of a KITTI-360 calibration file."""
+    # YAML libraries reject the first line that OpenCV writes.
     content, _ = parse_yaml(read_text(path).replace("%YAML:1.0", "", 1), path)
     with described_in(path, "image_width, image_height, xi, k1 k2 p1 p2, gamma1 gamma2 u0 v0"):
         sections = [content[f"{kind}_parameters"] for kind in ("mirror", "distortion")]

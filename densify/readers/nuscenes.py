@@ -58,13 +58,13 @@ def stamp_ns(record: Record) -> int:
     return int(np.int64(int(record["timestamp"]) * 1000))
 
 
-def pose_of(record: Record, where: str) -> Float:
+def _pose_of(record: Record, where: str) -> Float:
     """Return the (4,4) pose (m) of a record with a quaternion w x y z and a translation."""
     return checks.quaternion_pose(record["rotation"], record["translation"], where)
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return all records of a JSON table, by their tokens."""
+    """Return all records of a JSON table by their tokens; InputError if missing or damaged."""
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
 
@@ -135,7 +135,7 @@ class Annotations:
                         f"expected one"
                     )
                 size_m = np.array(record["size"], np.float64)[_LENGTH_WIDTH_HEIGHT]
-                boxes[sample][instance] = KeyBox(pose_of(record, where), size_m)
+                boxes[sample][instance] = KeyBox(_pose_of(record, where), size_m)
         key_ns = np.array([stamp_ns(samples[token]) for token in order], np.int64)
         return Annotations(str(path), key_ns, (*boxes.values(),)) if any(boxes.values()) else None
 
@@ -174,7 +174,7 @@ class Annotations:
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
-    """Open a scene, such as ``scene-0061``, by the folder of the JSON tables or by its parent."""
+    """Return a scene, such as ``scene-0061``, of the folder of the JSON tables or its parent."""
     folders = [path] if (path / "sample_data.json").is_file() else []
     folders = folders or sorted(file.parent for file in path.glob("v*/sample_data.json"))
     if not folders:
@@ -194,7 +194,7 @@ class Datum(NamedTuple):
     """A sweep or image of a scene."""
 
     stamp_ns: int
-    path: Path  # of its file, which may be missing on the disk
+    path: Path  # path of its file, which may be missing on the disk
     T_ego_sensor: Float  # (4,4) pose of the sensor in the vehicle's frame
     size_px: tuple[int, int]  # width and height of an image; zeros for a sweep
     intrinsics: Any  # camera matrix (3 x 3) as parsed from JSON
@@ -213,7 +213,7 @@ def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseT
             f"{len(records)} records in sample_data.json"
         )
     T_world_ego = {
-        stamp_ns(record): pose_of(record, f"{poses_file}: record {token}")
+        stamp_ns(record): _pose_of(record, f"{poses_file}: record {token}")
         for token, record in poses.items()
     }
     stamps_ns = sorted(T_world_ego)
@@ -230,7 +230,7 @@ def _channels(tables: Path, records: Sequence[Record]) -> dict[str, Channels]:
     path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
     tokens = {record["calibrated_sensor_token"] for record in records}
-    T = {token: pose_of(calibrated[token], f"{path}: record {token}") for token in tokens}
+    T = {token: _pose_of(calibrated[token], f"{path}: record {token}") for token in tokens}
     channels: dict[str, Channels] = defaultdict(lambda: defaultdict(dict))
     for record in records:
         token = record["calibrated_sensor_token"]
@@ -239,9 +239,9 @@ def _channels(tables: Path, records: Sequence[Record]) -> dict[str, Channels]:
         channel[len(channel)] = Datum(
             stamp_ns(record),
             checks.file_within(tables.parent, record["filename"], table),
-            T[token],
-            (int(record.get("width") or 0), int(record.get("height") or 0)),
-            calibrated[token].get("camera_intrinsic"),
+            T_ego_sensor=T[token],
+            size_px=(int(record.get("width") or 0), int(record.get("height") or 0)),
+            intrinsics=calibrated[token].get("camera_intrinsic"),
         )
     return channels
 
@@ -274,14 +274,14 @@ class NuScenes(FileSequence):
             name,
             root,
             list(sweeps),
-            {channel: self._camera(channel, data[0]) for channel, data in self._images.items()},
-            {
+            cameras={c: self._camera(c, data[0]) for c, data in self._images.items()},
+            exposed_ns={
                 channel: {number: self._images[channel][number].stamp_ns for number in files}
                 for channel, files in images.items()
             },
-            checks.truth_beside(root),
-            sweeps,
-            images,
+            truth=checks.truth_beside(root),
+            files=sweeps,
+            images=images,
         )
 
     def _camera(self, name: str, image: Datum) -> Camera:
@@ -317,7 +317,7 @@ class NuScenes(FileSequence):
         # A new firing begins where the ring number falls.
         column: Int = np.cumsum(np.diff(rows[:, 4], prepend=0.0) < 0, dtype=np.int64)
         offset_ns: Int = (column - column[-1:]) * _COLUMN_NS
-        points = self._track.as_fired(rows[:, :3], self._stamps_ns[frame], offset_ns)
+        points = self._track.undo_compensation(rows[:, :3], self._stamps_ns[frame], offset_ns)
         points[np.linalg.norm(points, axis=1) < _NO_RETURN_M] = 0.0
         return Returns(points, (rows[:, 3] / 255).astype(np.float32), offset_ns)
 

@@ -6,8 +6,8 @@ Velodyne (extra ``velodyne``): the packets do not identify the model reliably; n
 to the accuracy of a packet, stamped when the computer captured its last packet. Incomplete turns at
 the ends are left out. ``offset_ns`` is computed from the packets' clock and the firing order.
 
-Ouster (extra ``ouster``): the ``.json`` metadata of the sensor is named after ``#``, or found by
-`find_metadata`. A sweep is a frame of the sensor, stamped when the computer captured its first
+Ouster (extra ``ouster``): the ``.json`` metadata of the sensor is named after ``#``, or is found
+beside the capture. A sweep is a frame of the sensor, stamped when the computer captured its first
 packet. The sensor's clock gives the firing times of columns since the first. Rays start on the
 spinning axis, the origin is on the base. Rows follow the range image. Of two returns of a ray the
 first is read.
@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, open_file, read_json, reason
+from densify.config.file_content import import_extra, open_file, read_json, reason
 from densify.geometry.types import Int
 from densify.readers.file_sequence import FileSequence, Returns
 
@@ -60,12 +60,12 @@ _HALF_WRAP = 1 << 15  # Ouster's packets count turns with 16 bits
 
 
 def open_recording(path: Path, scene: str | None) -> FileSequence:
-    """Open a ``.pcap`` capture; ``scene`` is a Velodyne's model or the name of Ouster metadata."""
+    """Return a ``.pcap`` capture; ``scene`` is a Velodyne's model or an Ouster's metadata file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a capture of packets (.pcap)")
     if scene in MODELS:
         return Velodyne(path, scene)
-    metadata = find_metadata(path) if scene is None else path.with_name(scene)
+    metadata = _find_metadata(path) if scene is None else path.with_name(scene)
     if metadata is not None and metadata.is_file():
         return Ouster(path, metadata)
     got = "no model and no metadata" if scene is None else f"the model or metadata {scene}"
@@ -77,7 +77,7 @@ def open_recording(path: Path, scene: str | None) -> FileSequence:
     )
 
 
-def find_metadata(path: Path) -> Path | None:
+def _find_metadata(path: Path) -> Path | None:
     """Return a capture's .json: the longest name that begins its own, or the only one; or None."""
     json_files = sorted(path.parent.glob("*.json"))
     named = [p for p in json_files if path.stem.startswith(p.stem)]
@@ -96,7 +96,7 @@ class Velodyne(FileSequence):
     """A Velodyne capture as a `LidarSequence`, stamped at the last packet of each sweep."""
 
     def __init__(self, path: Path, model: str) -> None:
-        self._library = needed("velodyne_decoder", "velodyne", "Velodyne captures")
+        self._library = import_extra("velodyne_decoder", "velodyne", "Velodyne captures")
         self._model = getattr(self._library.Model, MODELS[model])
         packets, num_twice = _once(_find_packets(path))
         self._begin, self._captured_ns, azimuth, clock_us = packets
@@ -111,7 +111,7 @@ class Velodyne(FileSequence):
         super().__init__(path.stem, path, range(len(self._turns)))
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """Return the number of packets, and of those that are lost or were captured twice."""
+        """Return one pair: "packets", and the numbers of packets read, lost and captured twice."""
         return _packet_counts(*self._packet_counts)
 
     def _returns(self, frame: int) -> Returns:
@@ -205,7 +205,8 @@ class Ouster(FileSequence):
     def __init__(self, path: Path, metadata: Path) -> None:
         # The decoder's modules
         core, pcap = (
-            needed(f"ouster.sdk.{name}", "ouster", "Ouster captures") for name in ("core", "pcap")
+            import_extra(f"ouster.sdk.{name}", "ouster", "Ouster captures")
+            for name in ("core", "pcap")
         )
         read_json(metadata)
         open_file(path).close()  # raises a clear error for an unreadable file
@@ -234,11 +235,11 @@ class Ouster(FileSequence):
         super().__init__(path.stem, path, range(len(index)))
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """Return the number of packets, and of those that are lost or were captured twice."""
+        """Return one pair: "packets", and the numbers of packets read, lost and captured twice."""
         packets = [p for _, p in self._packets if isinstance(p, self._is_lidar_packet)]
         turn = np.array([p.frame_id() for p in packets], np.int64)
         column = [int(p.format.packet_header(self._column, p.buf)[0]) for p in packets]
-        num_lost, num_twice = lost_and_doubled(turn, np.array(column, np.int64))
+        num_lost, num_twice = count_lost_and_repeated(turn, np.array(column, np.int64))
         return _packet_counts(len(packets) - num_twice, num_lost, num_twice)
 
     def _returns(self, frame: int) -> Returns:
@@ -267,10 +268,11 @@ class Ouster(FileSequence):
         )
 
 
-def lost_and_doubled(turn: Int, column: Int) -> tuple[int, int]:
-    """Return the number of packets missing between others, and of those captured a second time.
+def count_lost_and_repeated(turn: Int, column: Int) -> tuple[int, int]:
+    """Return the number of packets missing between P others, and of those captured twice.
 
-    ``turn`` (P,) of the packets wraps at 16 bits; ``column`` (P,) is the first column of each.
+    ``turn`` (P,) is the number of each packet's turn, of 16 bits, so that it starts again from 0.
+    ``column`` (P,) is the first column of each packet.
     """
     step = np.diff(turn, prepend=turn[:1])
     turn = np.cumsum((step + _HALF_WRAP) % (2 * _HALF_WRAP) - _HALF_WRAP)

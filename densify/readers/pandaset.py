@@ -54,7 +54,7 @@ _LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
 
 
 def open_recording(path: Path, scene: str | None) -> PandaSet:
-    """Open a PandaSet sequence by its folder; a sequence has no scenes."""
+    """Return the PandaSet sequence in a folder; ``scene`` is not used."""
     return PandaSet(path)
 
 
@@ -97,9 +97,9 @@ class PandaSet(FileSequence):
             tuple(sorted(sweeps)),
             cameras,
             exposed_ns,
-            checks.truth_beside(path),
-            sweeps,
-            images,
+            truth=checks.truth_beside(path),
+            files=sweeps,
+            images=images,
         )
 
     def T_world_cam(self, camera: str, number: int) -> Float:
@@ -123,11 +123,11 @@ class PandaSet(FileSequence):
         T_lidar_world = poses.inverse(self._track.at(stamp_ns))
         points = poses.transform(T_lidar_world, np.column_stack([x, y, z]))
         return Returns(
-            self._track.as_fired(points, stamp_ns, offset_ns),
+            self._track.undo_compensation(points, stamp_ns, offset_ns),
             (brightness / 255).astype(np.float32),
             offset_ns,
-            np.clip(scanner, 0, 1).astype(np.uint8),
-            np.stack([np.zeros(3), PANDAR_GT_M]),
+            lidar=np.clip(scanner, 0, 1).astype(np.uint8),
+            scanner_origins=np.stack([np.zeros(3), PANDAR_GT_M]),
         )
 
     def _pose(self, frame: int) -> Float:

@@ -60,7 +60,7 @@ class Fields:
 
 
 def find_fields(names: Collection[str]) -> Fields:
-    """Find the field of each quantity by its name, in any case; the order of aliases decides."""
+    """Return the field of each quantity by its usual names, in any case; "" without."""
     # CloudCompare puts scalar_ before the names of fields.
     lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
     field_of_quantity = {
@@ -146,7 +146,7 @@ def _extent(times: NDArray[Any]) -> tuple[float, float]:
 
 
 def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K, Columns]:
-    """Read the columns of up to 5 readable sweeps with points, spread over a recording."""
+    """Return the columns that ``read`` gives of up to 5 readable sweeps with points, spread out."""
     columns_of_sweep, errors = dict[K, Columns](), list[InputError]()
     for sweep in sweeps[:: max(1, len(sweeps) // _NUM_SAMPLED)][:_NUM_SAMPLED]:
         try:
@@ -176,7 +176,14 @@ def find_times(
     period_ns: int,
     stamps_ns: Sequence[int] | None,
 ) -> tuple[PointTimes | None, str]:
-    """Return the meaning of the sweeps' point times and its description, or None and the reason."""
+    """Return how to convert point times, None if that is impossible, and a text on it.
+
+    Args:
+        field: Name of the field, and the user's settings.
+        sweeps: Values (N,) of the field in some sweeps.
+        period_ns: Time between consecutive sweeps.
+        stamps_ns: Stamp of each of these sweeps, None without stamps.
+    """
     finite = [values[np.isfinite(values)] for values in sweeps]
     extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
     middle, reach = np.median(extents, axis=0).tolist()
@@ -239,7 +246,7 @@ def full_scale(intensity: NDArray[Any]) -> float:
     return next((scale for scale in _FULL_SCALES if greatest <= scale), greatest)
 
 
-def scaled(intensity: NDArray[Any], scale: float) -> Float32:
+def rescale(intensity: NDArray[Any], scale: float) -> Float32:
     """Return intensities divided by ``scale`` and clipped to 0 to 1; NaN and infinity give 0."""
     share = np.nan_to_num(intensity.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / scale
     return np.clip(share, 0, 1).astype(np.float32)
@@ -264,9 +271,11 @@ class PointLayout:
         intensity_scale: float = 0.0,
         **times: Any,
     ) -> PointLayout:
-        """Find the meaning of the fields from several sweeps of a sensor.
+        """Return the meaning of the fields, found in several sweeps of a sensor.
 
         Args:
+            sweeps: Columns of each sweep by name.
+            where: File, with which messages begin.
             period_ns: Time between consecutive sweeps.
             stamps_ns: Stamp of each sweep, None without stamps.
             named: Quantity -> name of its field, where the user states it.
@@ -295,6 +304,7 @@ class PointLayout:
         """Return all N rows of a sweep, and a mask (N,) of the valid rows.
 
         Valid rows have a finite position, not 0 0 0, and a time inside the sweep; others get 0 0 0.
+        Raise InputError, whose message begins with ``where``, if a column is missing.
         """
         missing = [name for name in vars(self.fields).values() if name and name not in columns]
         if missing:
@@ -309,7 +319,7 @@ class PointLayout:
             valid &= np.isfinite(columns[self.fields.lidar])
         intensity = None
         if self.fields.intensity:
-            intensity = scaled(columns[self.fields.intensity], self.intensity_scale)
+            intensity = rescale(columns[self.fields.intensity], self.intensity_scale)
         offset_ns = None
         num_untimed = 0
         if self.times is not None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import check_size, decode_text, needed, read_bytes, reason
+from densify.config.file_content import check_size, decode_text, import_extra, read_bytes, reason
 from densify.readers.decoded_files import read_array, read_arrays, read_las
 
 Columns = dict[str, NDArray[Any]]
@@ -41,10 +41,10 @@ _MOST_RINGS, _MOST_ELONGATION, _MOST_ASCENDING = 256, 2.0, 0.9
 
 @dataclass(frozen=True)
 class PointTable:
-    """The N points of a file."""
+    """The N points of a file; ``len()`` is N."""
 
-    # Values (N,) of each column as stored, by name. Columns that have no name in the file get the
-    # names of `unnamed`.
+    # Values (N,) of each column as stored, by name. Columns without a name in the file are x, y, z,
+    # intensity, column4, column5 and so on.
     columns: Columns
     # Further arrays of an .npz file, by name
     beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -54,7 +54,10 @@ class PointTable:
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Read all rows of a point file, in file order; ``names`` replace the columns of `unnamed`.
+    """Return all rows of a point file, in file order; raise InputError if damaged or without rows.
+
+    ``names`` are the names of the columns in .bin, .csv, .txt and unstructured arrays. None takes
+    the names of the first line, or x, y, z, intensity, column4, column5 and so on.
 
     .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
                 values fit one of them
@@ -82,7 +85,7 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
     return table
 
 
-def unnamed(num_columns: int) -> tuple[str, ...]:
+def _default_column_names(num_columns: int) -> tuple[str, ...]:
     """Return default column names: x, y, z, intensity, column4, column5 and so on."""
     numbered = (f"column{number}" for number in range(len(_UNNAMED), num_columns))
     return (*_UNNAMED[:num_columns], *numbered)
@@ -104,7 +107,7 @@ def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Col
             f"{path}: got an array of shape {array.shape} and type {array.dtype}, expected numbers "
             f"of shape (N,3) or more columns, {_MOST_COLUMNS} at most"
         )
-    names = unnamed(array.shape[1]) if names is None else names
+    names = _default_column_names(array.shape[1]) if names is None else names
     if len(names) != array.shape[1]:
         raise InputError(
             f"{path}: got {array.shape[1]} columns, expected {len(names)}: {' '.join(names)}"
@@ -298,7 +301,7 @@ def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
 
 def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
     """Read the vertices of a .ply file."""
-    ply = needed("trimesh.exchange.ply", "ply", ".ply files")
+    ply = import_extra("trimesh.exchange.ply", "ply", ".ply files")
     file = io.BytesIO(read_bytes(path).removeprefix(codecs.BOM_UTF8))
     vertex = ply.load_ply(file)["metadata"]["_ply_raw"]["vertex"]
     names = [name for name, kind in vertex["properties"].items() if "LIST" not in kind]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, open_file, reason
+from densify.config.file_content import import_extra, open_file, reason
 from densify.geometry.types import Bool, Camera, Float32, Prior
 from densify.readers import checks
 from densify.readers.decoded_files import check_pixels, read_array, read_image
@@ -43,7 +43,10 @@ class PriorFiles:
 
     @staticmethod
     def open(path: Path, cameras: Sequence[str]) -> PriorFiles:
-        """Find the prior files of cameras."""
+        """Return the prior files of the cameras in a folder, or of one camera in a file or folder.
+
+        Raise InputError if nothing is found, or if files of one camera have to serve several.
+        """
         where = f"prior {path}"
         example = "0000000120.npy, .exr or .png"
         if not path.exists():
@@ -72,9 +75,9 @@ class PriorFiles:
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
-        """Read an image's prior at the camera's size (H,W); None if it has no prior.
+        """Return an image's prior at the camera's size (H,W); None if it has no prior.
 
-        A prior of another size is resized if its aspect ratio agrees to 2 %.
+        A prior of another size is resized if its aspect ratio agrees to 2 %; else raise InputError.
         """
         path = self.values[camera.name].get(number)
         if path is None:
@@ -113,7 +116,7 @@ def _read_values(path: Path) -> Float32:
 
 def _read_exr(path: Path) -> NDArray[Any]:
     """Read the channel of depth of an EXR file."""
-    library = needed("OpenEXR", "exr", "EXR files")
+    library = import_extra("OpenEXR", "exr", "EXR files")
     open_file(path).close()
     try:
         header = library.File(str(path), header_only=True).header()

@@ -16,7 +16,7 @@ from densify.geometry import poses
 from densify.geometry.types import Float, Int
 from densify.readers import checks
 from densify.readers.file_sequence import Returns
-from densify.readers.stamped_files import TIME_COLUMNS, TextTable, existing
+from densify.readers.stamped_files import TIME_COLUMNS, TextTable, require_path
 from densify.readers.timeline import format_frames
 
 _PCD_HEADER = 4096  # bytes that hold the header of a .pcd file
@@ -47,7 +47,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return T_world_ego (4,4) at a time, interpolated, or extrapolated by up to 0.2 s."""
+        """Return T_world_ego (4,4) at a time, interpolated, up to 0.2 s beyond; else InputError."""
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
         if beyond_ns > _MAX_BEYOND_NS:
@@ -63,8 +63,8 @@ class PoseTrack:
         fraction = (time_ns - int(self.stamp_ns[before])) / span_ns
         return poses.interpolate(self.T_world_ego[before], self.T_world_ego[after], fraction)
 
-    def as_fired(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Undo ego-motion compensation: return points in the vehicle frame at their firing times.
+    def undo_compensation(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
+        """Return points in the vehicle frame at their firing times; undo ego-motion compensation.
 
         Many data sets store a sweep as if measured at one time, which smears moving objects and
         bends rings.
@@ -78,15 +78,15 @@ class PoseTrack:
         fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
 
-    def compensated(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Move (N,3) points from their firing times to ``stamp_ns``; the opposite of `as_fired`."""
+    def compensate(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
+        """Return (N,3) points moved from firing times to ``stamp_ns``, as data sets store them."""
         return self._carry(points, stamp_ns, offset_ns, inverse=False)
 
-    def taken_back(self, placed: Returns, stamp_ns: int) -> Returns:
+    def undo_placement(self, placed: Returns, stamp_ns: int) -> Returns:
         """Return world points as fired, or without times in the vehicle frame at ``stamp_ns``."""
-        points = taken_back(placed.points, self.at(stamp_ns))
+        points = transform_from_world(placed.points, self.at(stamp_ns))
         if placed.offset_ns is not None:
-            points = self.as_fired(points, stamp_ns, placed.offset_ns)
+            points = self.undo_compensation(points, stamp_ns, placed.offset_ns)
         return replace(placed, points=points)
 
     def _carry(self, points: Float, stamp_ns: int, offset_ns: Int, inverse: bool) -> Float:
@@ -110,7 +110,7 @@ class PoseTrack:
         return turns.apply(points) + shift_m
 
 
-def taken_back(placed: Float, T_world_ego: Float) -> Float:
+def transform_from_world(placed: Float, T_world_ego: Float) -> Float:
     """Return world points (N,3) in the frame of a pose (4,4). Padding at 0 0 0 stays."""
     points = poses.transform(poses.inverse(T_world_ego), placed)
     return np.where(placed.any(axis=1, keepdims=True), points, placed)
@@ -130,13 +130,14 @@ class PoseFile:
     def of_folder(
         folder: Path, name: str, unit: str, sweeps: Mapping[int, Path]
     ) -> PoseFile | None:
-        """Read the poses of a recording; None without any.
+        """Return the poses of a recording; None without any.
 
-        ``name`` is the pose file; "" searches for a usual name, a .pose file beside each sweep, or
-        the viewpoints of .pcd files. ``unit`` is the unit of the times, "" to find it.
+        ``name`` is the pose file. "" searches for a usual name, a .pose file beside each of the
+        ``sweeps`` (file by frame), or the viewpoints of .pcd files. ``unit`` is the unit of the
+        times, "" to find it.
         """
         if name:
-            return PoseFile.read(existing(folder, name, "poses: {file: ...}"), unit)
+            return PoseFile.read(require_path(folder, name, "poses: {file: ...}"), unit)
         for path in (folder / usual for usual in _POSE_FILES):
             if path.is_file():
                 return PoseFile.read(path, unit)
@@ -148,7 +149,7 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Read a file with a pose on each line; ``unit`` is the times' unit, "" to find it."""
+        """Return the poses of a file, one on each line; ``unit`` is the times', "" to find it."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         columns = [i for names in (*_TURNS, *_POSITIONS) if (i := table.column(names)) is not None]
         width, form, time = len(table.rows[0]), "table with quaternions", None
@@ -172,7 +173,7 @@ class PoseFile:
             if columns:
                 T.append(checks.quaternion_pose(values[:4], values[4:], where))
             else:
-                T.append(checks.rigid(values, where))
+                T.append(checks.pose(values, where))
         stamps_ns = None
         if time is not None:
             stamps_ns, _ = table.times_ns(time, unit)
@@ -199,7 +200,12 @@ class PoseFile:
             return None
 
     def by_frame(self, frames: Sequence[int]) -> dict[int, Float]:
-        """Return the (4,4) poses of ascending ``frames``, listed in order or by number from 0."""
+        """Return frame number -> (4,4) pose; ``frames`` are the recording's, ascending.
+
+        Poses of files for each sweep keep their frames. As many poses as ``frames`` are in their
+        order. More poses than the last frame number belong to the numbers from 0. Otherwise raise
+        InputError.
+        """
         if self.frames is not None:
             return dict(zip(self.frames, self.T, strict=True))
         if len(self.T) == len(frames):
@@ -217,7 +223,7 @@ def _one_pose(path: Path) -> Float:
     text = read_text(path)
     values = checks.parse_numbers(text, str(path), len(text.split()))
     if len(values) in (12, 16):
-        return checks.rigid(values, str(path))
+        return checks.pose(values, str(path))
     if len(values) == 7:
         return checks.quaternion_pose(values[[6, 3, 4, 5]], values[:3], str(path))
     raise InputError(

@@ -63,7 +63,7 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 def open_recording(path: Path, scene: str | None) -> RosBag:
-    """Open a bag; ``scene`` has its topics, such as ``points=/lidar&images=none``, None to find."""
+    """Return a bag; ``scene`` names topics, such as ``points=/lidar&images=none``, None to find."""
     return RosBag(path, scene)
 
 
@@ -79,7 +79,7 @@ class Topics(NamedTuple):
 
     @staticmethod
     def choose(bag: Bag, options: str | None) -> Topics:
-        """Choose the topics by the ``options`` after ``#``, None without, and the message types."""
+        """Return the topics by the ``options`` after ``#`` (None: none) and the message types."""
         named = dict(parse_qsl(options or "", keep_blank_values=True))
         unknown = [key for key in named if key not in _TYPES]
         if unknown or (options and not named):
@@ -157,7 +157,7 @@ class Transforms:
 
     @staticmethod
     def read(bag: Bag) -> Transforms:
-        """Read all transforms of /tf_static and /tf. A frame that never moves in /tf is fixed."""
+        """Return all transforms of /tf_static and /tf; a frame that never moves in /tf is fixed."""
         tree = Transforms(str(bag.path))
         recorded: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
         for topic in bag.of_type(*TRANSFORMS):
@@ -301,7 +301,7 @@ class RosBag(FileSequence):
         super().__init__(path.resolve().name, path, frames, cameras, exposed_ns, truth)
 
     def findings(self) -> Sequence[tuple[str, str]]:
-        """Return the chosen topics and assumptions as pairs of a label and a text."""
+        """Return the chosen topics and assumptions as (label, text) pairs."""
         lines = []
         for lidar in self._lidars:
             layout, undone = lidar.layout, f", out of the world of {self._topics.poses}"
@@ -347,10 +347,10 @@ class RosBag(FileSequence):
             np.concatenate([cloud.points for cloud in clouds]),
             np.concatenate(intensities),
             np.concatenate(offsets_ns) if len(offsets_ns) == len(clouds) else None,
-            np.concatenate(
+            lidar=np.concatenate(
                 [np.full(len(cloud.points), number, np.uint8) for number, cloud in numbered_clouds]
             ),
-            origins if len(self._lidars) > 1 else None,
+            scanner_origins=origins if len(self._lidars) > 1 else None,
             num_untimed=sum(cloud.num_untimed for cloud in clouds),
         )
 
@@ -363,7 +363,7 @@ class RosBag(FileSequence):
             track, source = self._track_and_source
             if track is None:
                 raise InputError(f"{self.where}: registered clouds need their odometry: {source}")
-            returns = track.taken_back(returns, entry.stamp_ns)
+            returns = track.undo_placement(returns, entry.stamp_ns)
         points = np.zeros_like(returns.points)
         points[valid] = poses.transform(lidar.T_first_lidar, returns.points[valid])
         offset_ns = returns.offset_ns

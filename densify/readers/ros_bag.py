@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.config.file_content import needed, open_file, reason
+from densify.config.file_content import import_extra, open_file, reason
 from densify.geometry.types import Camera, Float
 from densify.readers import checks
 from densify.readers.decoded_files import decode_image
@@ -100,7 +100,7 @@ class Recorded(NamedTuple):
 
 
 class Bag:
-    """A ROS 1 or ROS 2 bag, opened for reading."""
+    """A ROS 1 or ROS 2 bag, opened for reading; raises InputError if it is missing or damaged."""
 
     def __init__(self, path: Path) -> None:
         # A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files that are
@@ -112,7 +112,7 @@ class Bag:
         for file in self._files:
             for data_file in [file] if file.is_file() else file.glob("*.*"):
                 open_file(data_file).close()  # raises a clear error for an unreadable file
-        package = needed(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
+        package = import_extra(f"rosbags.rosbag{2 if self._is_ros2 else 1}", "ros", "ROS bags")
         self._lock = RLock()
         # Indexed messages without a header stamp, and messages recorded twice, by topic
         self.num_unstamped = Counter[str]()
@@ -130,7 +130,10 @@ class Bag:
         return [topic for topic in self.topics.values() if topic.type in types]
 
     def index(self, topics: Collection[str]) -> dict[str, list[Entry]]:
-        """Return each topic's entries by ascending stamp; count those unstamped and those twice."""
+        """Return each topic's entries by ascending stamp, without decoding the messages.
+
+        A message recorded twice has one entry. This adds to ``num_unstamped`` and ``num_twice``.
+        """
         entries_of_topic: dict[str, list[Entry]] = {topic: [] for topic in topics}
         num_recorded_at = Counter[tuple[str, int]]()
         indexed: set[tuple[str, int, int]] = set()
@@ -150,7 +153,7 @@ class Bag:
         return {topic: sorted(entries) for topic, entries in entries_of_topic.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:
-        """Decode the message of an index entry; raise InputError if it is missing or damaged."""
+        """Return the decoded message of an index entry; InputError if it is missing or damaged."""
         recorded = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
         if len(recorded) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
@@ -203,7 +206,7 @@ class Bag:
 def message_types(is_ros2: bool) -> Any:
     """Return the rosbags type store with the standard, /tf and Livox message types."""
     # Definitions in a bag are not used, because rosbags turns definitions into executable code.
-    typesys = needed("rosbags.typesys", "ros", "ROS bags")
+    typesys = import_extra("rosbags.typesys", "ros", "ROS bags")
     stores = typesys.Stores
     types = typesys.get_typestore(stores.ROS2_JAZZY if is_ros2 else stores.ROS1_NOETIC)
     for name, text in _DEFINITIONS.items():
@@ -275,7 +278,7 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
 
 
 def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Return the one-number fields of a PointCloud2 or Livox CustomMsg by name, (N,) as stored."""
+    """Return a cloud message's fields of one number by name, (N,) as stored; else InputError."""
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
         table = np.array(rows, list(_LIVOX.items()))
@@ -331,7 +334,7 @@ def check_encoding(message: Any, where: str) -> None:
 
 
 def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
-    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB."""
+    """Return an Image or CompressedImage message as (H,W,3) uint8 RGB, or raise InputError."""
     import cv2
 
     check_encoding(message, where)
@@ -350,12 +353,15 @@ def image_rgb(message: Any, where: str) -> NDArray[np.uint8]:
 
 
 def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, where: str) -> Camera:
-    """Convert a CameraInfo message to a camera, adjusted for binning and region of interest.
+    """Return the camera of a CameraInfo message, adjusted for binning and region of interest.
 
     Args:
+        info: Decoded CameraInfo message.
+        name: Name of the camera.
         T_optical_lidar: (4,4) pose of the lidar in the message's optical frame.
         rectified: True for rectified images, which use P and the rotation R; raw images use K and
             the distortion D.
+        where: Topic, with which the message of an InputError begins.
     """
     matrix = {  # ROS 1 writes K, ROS 2 k
         key: np.asarray(getattr(info, key if hasattr(info, key) else key.upper()), np.float64)
@@ -373,7 +379,7 @@ def camera_of(info: Any, name: str, T_optical_lidar: Float, rectified: bool, whe
     if not rectified:
         model, distortion = _lens(info.distortion_model, tuple(matrix["d"].tolist()), where)
     elif matrix["r"].any():  # drivers leave zeros where they do not say
-        T = checks.rigid(np.column_stack([matrix["r"].reshape(3, 3), np.zeros(3)]), where) @ T
+        T = checks.pose(np.column_stack([matrix["r"].reshape(3, 3), np.zeros(3)]), where) @ T
     camera = Camera(name, int(info.width), int(info.height), K, T, distortion, model)
     return _binned(camera, info)
 

@@ -30,7 +30,7 @@ _SECONDS_AND_NS = re.compile(r"(?<!\d)(\d{10})[_-](\d{9})(?!\d)")
 _MAX_NUMBER_DIGITS = 18  # a longer number is no frame number
 
 
-def in_ns(text: str, unit: str) -> int:
+def _to_ns(text: str, unit: str) -> int:
     """Convert a decimal number in ``unit`` to ns, exactly; raise ValueError if impossible."""
     try:
         value = Decimal(text)
@@ -45,7 +45,7 @@ def in_ns(text: str, unit: str) -> int:
 
 
 def date_ns(text: str) -> int:
-    """Convert an ISO date in UTC to ns since 1970 without loss; raise ValueError for others."""
+    """Return an ISO date in UTC as ns since 1970, without loss; ValueError for other texts."""
     day = np.datetime64(text, "D")  # numpy wraps years beyond 64 bits
     if not np.datetime64("1970-01-01") <= day < np.datetime64("2262-01-01"):
         raise ValueError(f"got {text!r}, expected a year from 1970 to 2261")
@@ -56,7 +56,7 @@ def _epoch_unit(text: str) -> str:
     """Return the unit in which a number is a time from 2000 to 2099, "" if no unit fits."""
     for unit in UNIT_NS:
         try:
-            if _EPOCH_NS[0] <= in_ns(text, unit) < _EPOCH_NS[1]:
+            if _EPOCH_NS[0] <= _to_ns(text, unit) < _EPOCH_NS[1]:
                 return unit
         except ValueError:
             continue
@@ -76,7 +76,7 @@ class TextTable(NamedTuple):
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
-        """Read a file; its first line names columns if it has a known name or begins with #."""
+        """Return the table of a file; the first line has names if one is known or if it has a #."""
         table = TextTable(path, [], [], [])
         for number, line in enumerate(read_text(path).splitlines(), 1):
             text = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", line.strip().strip("#,;").strip())
@@ -98,7 +98,7 @@ class TextTable(NamedTuple):
         return table
 
     def column(self, choices: Collection[str]) -> int | None:
-        """Return the index of the first of the names in ``choices`` that is a column, else None."""
+        """Return the index of the first column among the names ``choices``, None without any."""
         indices = (self.names.index(name) for name in choices if name in self.names)
         return next((index for index in indices if index < len(self.rows[0])), None)
 
@@ -113,7 +113,7 @@ class TextTable(NamedTuple):
         times_ns = []
         for line, text in zip(self.lines, times, strict=True):
             try:
-                times_ns.append(date_ns(text.rstrip("Z")) if dates else in_ns(text, known or "s"))
+                times_ns.append(date_ns(text.rstrip("Z")) if dates else _to_ns(text, known or "s"))
             except ValueError:
                 raise InputError(
                     f"{self.path}: line {line}: got {text!r}, expected a time in {known or 's'}, "
@@ -151,7 +151,7 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """Read a time from each line, alone or among columns: a number of ``unit``, or a date."""
+        """Return the times in a file's lines, dates or numbers of ``unit``; "" finds the unit."""
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         time_column = table.column(TIME_COLUMNS)
         name_column = table.column(_FILE_COLUMNS)
@@ -171,7 +171,12 @@ class StampFile(NamedTuple):
         return StampFile(path, stamps_ns, unit, names)
 
     def of(self, paths: Mapping[int, Path]) -> dict[int, int]:
-        """Return the stamps (ns) of files by number; lines belong by name, order or number."""
+        """Return the stamps (ns) of files by their numbers.
+
+        Lines with names belong to the files of these names. As many lines as files are in the
+        files' order. Otherwise line k, from 0, is of the number k. Raise InputError if a file has
+        no line.
+        """
         if self.names is not None:
             by_name = {Path(n).stem: ns for n, ns in zip(self.names, self.stamp_ns, strict=True)}
             missing = [path for path in paths.values() if path.stem not in by_name]
@@ -202,20 +207,20 @@ class NamedFile(NamedTuple):
 
     @staticmethod
     def of(path: Path, unit: str = "") -> NamedFile:
-        """Find the number or the time in a name; with a ``unit`` the last number is a time."""
+        """Return the number or the time in a name; with a ``unit``, its last number is a time."""
         # 0000000120 and cloud_12 are numbers. 1317042651.468569638, 1317042651_468569638 and
         # 1317042651468 are times since 1970.
         words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
         if unit:
             try:
-                return NamedFile(path, None, in_ns(words[-1] if words else "", unit))
+                return NamedFile(path, None, _to_ns(words[-1] if words else "", unit))
             except ValueError:
                 return NamedFile(path, None, None)
         for word in reversed(words):
             epoch = _epoch_unit(word)
             # Ten digits without a fraction are a frame number, as in KITTI's file names.
             if epoch and (epoch != "s" or "." in word) and not word.startswith("0"):
-                return NamedFile(path, None, in_ns(word, epoch))
+                return NamedFile(path, None, _to_ns(word, epoch))
         digits = [word for word in re.findall(r"\d+", path.stem) if len(word) <= _MAX_NUMBER_DIGITS]
         return NamedFile(path, int(digits[-1]) if digits else None, None)
 
@@ -230,13 +235,14 @@ class Series:
     stamped_by: str  # source of the stamps, for people; "" without stamps
 
 
-def in_time(
+def order_files(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
-    """Order files by time and find their stamps; files whose names are times are numbered from 0.
+    """Return files in the order of time; those whose names are times are numbered from 0.
 
     Args:
-        paths: Files.
+        root: Folder of the recording.
+        paths: Files of sweeps or images, in one folder.
         stamps: "names" if file names are stamps, "sweeps" for files without stamps, the name of a
             stamp file beside the files or below ``root``, or "" to search for one.
         unit: Unit of the stamps, "" to detect it.
@@ -289,14 +295,14 @@ def _numbered(names: Sequence[NamedFile]) -> dict[int, NamedFile]:
 
 def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | None:
     if name:
-        return existing(folder if (folder / name).is_file() else root, name, "stamps")
+        return require_path(folder if (folder / name).is_file() else root, name, "stamps")
     searched = [folder] + [folder.parent] * (folder != root and (shared or folder.parent != root))
     files = (directory / file for directory in searched for file in _STAMP_FILES)
     return next((file for file in files if file.is_file()), None)
 
 
-def existing(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
-    """Return the file or folder ``name`` that densify.yaml gives under ``key``, if it exists."""
+def require_path(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
+    """Return the file or folder ``name`` that densify.yaml gives as ``key``; InputError without."""
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):
         kind = "folder" if is_folder else "file"

@@ -19,7 +19,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.config.cache import Cache, kept, own_folder
+from densify.config.cache import Cache, get_cached, own_folder
 from densify.config.errors import InputError
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
@@ -37,7 +37,7 @@ _NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole 
 
 
 class Street:
-    """The built-in simulated street; members as in `LidarSequence`."""
+    """The built-in simulated street, 16 seconds long; members as in `LidarSequence`."""
 
     def __init__(
         self,
@@ -48,12 +48,16 @@ class Street:
         tilt_deg: float = 0.0,
         cameras: tuple[str, ...] = USUAL,
     ) -> None:
-        """Set up the street; sweeps and images are rendered on demand.
+        """Set up the street; sweeps and images are rendered on demand. InputError for other values.
 
         Args:
             preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the
                 ego vehicle stands).
+            seed: Number from 0 that determines the random values.
+            sensor: Name of a lidar in `densify.street.lidar.SENSORS`.
+            hz: Sweeps per second: 5, 10 or 20.
             tilt_deg: Pitch of the lidar's mount, nose down. Cameras are not tilted.
+            cameras: Names of the cameras.
         """
         _check("preset", preset, PRESETS)
         _check("sensor", sensor, SENSORS)
@@ -78,7 +82,7 @@ class Street:
 
     @staticmethod
     def from_spec(spec: str) -> Street:
-        """Create a street from a text such as ``street:crossing?seed=2&sensor=vlp16``."""
+        """Return the street of a text such as ``street:crossing?seed=2&sensor=vlp16``."""
         head, _, query = spec.partition("?")
         reader, _, preset = head.partition(":")
         if reader != "street":
@@ -130,7 +134,7 @@ class Street:
             list(pool.map(self.returns, frames))
 
     def picture(self, camera: str, number: int) -> Picture:
-        """Return an image with the exact depth and the simulated body at each pixel."""
+        """Return an image with the exact depth and the simulated body of each pixel."""
         stamps_ns = self.image_stamps_ns(camera)
         if number not in stamps_ns:
             raise InputError(
@@ -150,7 +154,7 @@ class Street:
     @cached_property
     def bodies(self) -> Bodies:
         """Poses of the scanner and of all simulated bodies at the reference time of each frame."""
-        return kept(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
+        return get_cached(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
 
     def _render_returns(self, frame: int) -> Returns:
         return self._from_cache(
@@ -170,7 +174,7 @@ class Street:
                 _ = self.simulator.scene.world.triangles  # made once, for all threads
             return render()
 
-        return kept(self._cache, step, lambda: inputs, rendered)
+        return get_cached(self._cache, step, lambda: inputs, rendered)
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the true pose T_world_lidar (4,4) at the sweep's reference time."""

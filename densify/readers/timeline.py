@@ -29,8 +29,8 @@ class WindowFrames(NamedTuple):
     cuts: tuple[str, ...]
 
 
-def runs(frames: Iterable[int]) -> list[range]:
-    """Return ascending frame numbers as ranges of consecutive numbers."""
+def to_runs(frames: Iterable[int]) -> list[range]:
+    """Return ascending frame numbers as ranges of consecutive numbers, in the same order."""
     ranges: list[range] = []
     for frame in frames:
         if ranges and frame == ranges[-1].stop:
@@ -41,8 +41,10 @@ def runs(frames: Iterable[int]) -> list[range]:
 
 
 def format_frames(frames: Iterable[int]) -> str:
-    """Format frame numbers for messages, as ``96-135, 140``; long lists are shortened."""
-    texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs(sorted(frames))]
+    """Return frame numbers as ascending text, such as ``96-135, 140``, shortened to 8 ranges."""
+    texts = [
+        f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in to_runs(sorted(frames))
+    ]
     if len(texts) > _MOST_RANGES:
         texts = [*texts[: _MOST_RANGES - 1], "...", texts[-1]]
     return ", ".join(texts) if texts else "none"
@@ -74,7 +76,11 @@ class Timeline:
 
     @staticmethod
     def of(sequence: LidarSequence) -> Timeline:
-        """Read the sweeps' stamps; those missing or out of order are interpolated by index."""
+        """Return the timeline of a recording.
+
+        Stamps that are missing or out of order are interpolated by index, and given in ``unknown``
+        with the reason. If no stamp can be read, all are 0.
+        """
         frames = tuple(sequence.frames)
         unknown = {}
         stamps_ns = np.zeros(len(frames), np.int64)
@@ -100,13 +106,13 @@ class Timeline:
 
     @cached_property
     def period_ns(self) -> int:
-        """Median time between consecutive sweeps."""
+        """Median time between consecutive sweeps in nanoseconds; 100 ms for a single sweep."""
         if len(self.frames) < 2:
             return _NOMINAL_PERIOD_NS
         return max(1, int(np.median(np.diff(self.stamp_ns))))
 
     def num_in(self, duration_s: float) -> int:
-        """Return the number of sweeps in a duration at the median rate, rounded."""
+        """Return the number of sweeps in a duration in seconds at the median rate, rounded."""
         return int(duration_s * 1e9 / self.period_ns + 0.5)
 
     @cached_property
@@ -123,8 +129,8 @@ class Timeline:
         inside = (self.stamp_ns >= begin_ns) & (self.stamp_ns < end_ns)
         return [self.frames[row] for row in np.flatnonzero(inside)]
 
-    def runs(self, frames: Collection[int]) -> list[list[int]]:
-        """Split frames into ascending consecutive series, also at holes over 3.1 median periods."""
+    def split_at_holes(self, frames: Collection[int]) -> list[list[int]]:
+        """Return series of consecutive sweeps, split also at steps over 3.1 median periods."""
         series: list[list[int]] = []  # indices of the sweeps
         for row in sorted(self.row[frame] for frame in frames):
             if series and series[-1][-1] == row - 1 and not self._hole_before(row):
@@ -146,7 +152,13 @@ class Timeline:
     ) -> WindowFrames:
         """Return the key frame and up to ``window`` sweeps before and after the key frame.
 
-        A side ends at the recording's end, a hole, or a sweep in ``left_out`` (frame -> reason).
+        A side ends early at the recording's end, at a hole in time, or before a left out sweep.
+        Raise InputError if the key frame does not exist or ``window`` is no number of sweeps.
+
+        Args:
+            key: Frame number of the key sweep.
+            window: Number of sweeps on each side, 0 or more.
+            left_out: Frame number of a sweep that cannot be used -> reason; None for none.
         """
         check_window(window)
         if key not in self.row:
@@ -207,15 +219,17 @@ def _out_of_order(stamps_ns: Int) -> list[int]:
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """Read a sweep and return it after `in_range`, without times if not ``settings.deskew``."""
-    sweep = in_range(sequence[frame], settings)
+    """Return a sweep after `remove_unusable_returns`, without firing times if not ``deskew``."""
+    sweep = remove_unusable_returns(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
 
 
-def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
-    """Return the sweep without returns that are too near (the own vehicle), too far or lone.
+def remove_unusable_returns(sweep: Sweep, settings: RegisterSettings) -> Sweep:
+    """Return the sweep without returns that are too near, too far or lone.
 
-    Ranges are from the scanner that fired. Near and lone returns (snow, rain, dust) are counted.
+    Near returns (from the own vehicle) and far ones are outside of ``min_range_m`` to
+    ``max_range_m`` from the scanner that fired. Lone returns are snow, rain and dust. The sweep's
+    ``num_near`` and ``num_lone`` count the removed ones.
     """
     origins_m = sweep.scanner_origins
     x, y, z = (sweep.points if origins_m is None else sweep.points - origins_m[sweep.lidar]).T
@@ -226,7 +240,10 @@ def in_range(sweep: Sweep, settings: RegisterSettings) -> Sweep:
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """Return the named cameras in order; for None those with images, or all if none has images."""
+    """Return the cameras of these names in this order; raise InputError for an unknown name.
+
+    For None, return the cameras with images, or all cameras if none has images.
+    """
     if isinstance(names, str) or not isinstance(names, Iterable | None):
         one = [*sequence.cameras][:1]
         raise InputError(f"cameras: got {names!r}, expected a list of names, such as {one}")
@@ -241,7 +258,7 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
 
 
 def recorded_trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep]) -> Trajectory:
-    """Return the recorded poses of the sweeps at their reference times, as a trajectory."""
+    """Return the recorded poses of the sweeps at their reference times; InputError without any."""
     return Trajectory(
         frames=tuple(sweep.frame for sweep in sweeps),
         stamp_ns=np.array([sweep.stamp_ns for sweep in sweeps], np.int64),

@@ -80,7 +80,7 @@ class FileTruth:
         return depth_m
 
     def moving_mask(self, camera: str, frame: int) -> Bool:
-        """Return a mask (H,W) of an image, True for pixels of moving objects."""
+        """Return an (H,W) mask of an image, True for pixels of moving objects."""
         moving: Bool = self._load(f"depth/{camera}/{frame:010d}.npz", "moving")[0]
         return moving
 

@@ -72,7 +72,10 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns of a component by short name; arguments are as in `read_arrow`."""
+        """Return columns (N,) of a component by short name.
+
+        ``kinds`` (by short name) and ``where`` (by full name) are as in `read_arrow`.
+        """
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -114,7 +117,7 @@ class Image(NamedTuple):
     T_world_vehicle: Float  # (4,4) pose of the vehicle in the world
 
 
-def read_lasers(segment: Segment) -> dict[int, Laser]:
+def _read_lasers(segment: Segment) -> dict[int, Laser]:
     """Return the lidars' calibrations by Waymo's number, from 1 (TOP)."""
     beams, low, high = (f"beam_inclination.{key}" for key in ("values", "min", "max"))
     kinds = {LASER: "i", "extrinsic.transform": "l", beams: "l", low: "m", high: "m"}
@@ -126,11 +129,11 @@ def read_lasers(segment: Segment) -> dict[int, Laser]:
         if not np.isfinite(bounds if beams_rad is None else beams_rad).all():
             raise InputError(f"{where}: got beams that are not finite, expected rad")
         bounds_rad = float(bounds[0]), float(bounds[1])
-        lasers[int(number)] = Laser(checks.rigid(T, where), beams_rad, bounds_rad)
+        lasers[int(number)] = Laser(checks.pose(T, where), beams_rad, bounds_rad)
     return lasers
 
 
-def read_boxes(segment: Segment) -> dict[int, Boxes]:
+def _read_boxes(segment: Segment) -> dict[int, Boxes]:
     """Return boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
     numbers = [f"box.{key}.{axis}" for key in ("center", "size") for axis in "xyz"]
     kinds = {STAMP: "i", OBJECT: "s", **dict.fromkeys((*numbers, "box.heading"), "n")}
@@ -145,7 +148,7 @@ def read_boxes(segment: Segment) -> dict[int, Boxes]:
     return boxes
 
 
-def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
+def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
     """Return times and poses of images by camera and frame; ``starts_us`` (n,) are the frames'."""
     keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
     seconds = ("pose_timestamp", *(f"rolling_shutter_params.{key}" for key in keys))
@@ -158,15 +161,17 @@ def read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]
             pose_s, shutter_s, trigger_s, done_s = map(float, times_s)
             name = dict(enumerate(CAMERAS, 1))[int(camera)]
             images_of_camera[name][frame] = Image(
-                _whole_us(pose_s),
-                _whole_us((trigger_s + done_s) / 2),
-                max(done_s - trigger_s - shutter_s, 0.0),
-                checks.rigid(T, f"{segment.file('camera_image')}: {name}, frame {frame}"),
+                pose_ns=_whole_us(pose_s),
+                exposed_ns=_whole_us((trigger_s + done_s) / 2),
+                readout_s=max(done_s - trigger_s - shutter_s, 0.0),
+                T_world_vehicle=checks.pose(
+                    T, f"{segment.file('camera_image')}: {name}, frame {frame}"
+                ),
             )
     return {name: images for name, images in images_of_camera.items() if images}
 
 
-def read_cameras(
+def _read_cameras(
     segment: Segment, images: Mapping[str, Mapping[int, Image]]
 ) -> Iterator[tuple[str, Camera]]:
     """Yield the calibrated cameras that have images, with their names and rolling shutters."""
@@ -185,7 +190,7 @@ def read_cameras(
         readout_s = float(np.median([image.readout_s for image in camera_images.values()]))
         x, y = _READOUT.get(direction, (0.0, 0.0))
         T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(
-            checks.rigid(columns["extrinsic.transform"][row], where)
+            checks.pose(columns["extrinsic.transform"][row], where)
         )
         yield (
             name,
@@ -208,7 +213,7 @@ def _whole_us(seconds: float) -> int:
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """Open a segment (CONTEXT) of the folder of a split, such as ``training``."""
+    """Return the segment ``scene`` (CONTEXT) of a split's folder; None for the only one."""
     names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
     none = (
         "no segments; expected files such as lidar/10017090168044687777_6380_000_6400_000.parquet"
@@ -229,9 +234,9 @@ class Waymo(FileSequence):
         self._period_ns = int(np.median(steps_ns)) if len(steps_ns) else _NOMINAL_PERIOD_NS
         has_images = segment.file("camera_image").is_file()
         with described_in(root, f"calibration and images of {context} in the data set's own form"):
-            self._lasers = read_lasers(segment)
-            self._images = read_images(segment, self._starts_us) if has_images else {}
-            cameras = dict(read_cameras(segment, self._images)) if has_images else {}
+            self._lasers = _read_lasers(segment)
+            self._images = _read_images(segment, self._starts_us) if has_images else {}
+            cameras = dict(_read_cameras(segment, self._images)) if has_images else {}
         front = self._images.get(CAMERAS[0], {})
         self._stamps_ns = [
             front[frame].pose_ns if frame in front else int(ns) + self._period_ns // 2
@@ -254,10 +259,10 @@ class Waymo(FileSequence):
 
     @cached_property
     def _boxes(self) -> dict[int, Boxes]:
-        return read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
+        return _read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the pose T_world_cam (4,4) at the middle of the exposure of image ``number``."""
+        """Return the (4,4) pose T_world_cam at the middle of the exposure of image ``number``."""
         image = self._images[camera][number]
         T_world_vehicle = image.T_world_vehicle
         if len(self.frames) > 1:
@@ -283,9 +288,9 @@ class Waymo(FileSequence):
             np.concatenate(points),
             np.concatenate(intensity).astype(np.float32),
             np.concatenate(offset_ns),
-            np.concatenate(lidar),
-            T[:, :3, 3],
-            checks.scanner_axes(T),
+            lidar=np.concatenate(lidar),
+            scanner_origins=T[:, :3, 3],
+            R_scanner_lidar=checks.scanner_axes(T),
         )
 
     def _range_images(self, frame: int) -> Iterator[tuple[int, Float]]:
@@ -316,11 +321,11 @@ class Waymo(FileSequence):
         kinds = {STAMP: "i", "world_from_vehicle.transform": "l"}
         columns = self._segment.read("vehicle_pose", kinds)
         T_of_start = {
-            int(us): checks.rigid(values, f"{where}: frame_timestamp_micros {us}")
+            int(us): checks.pose(values, f"{where}: frame_timestamp_micros {us}")
             for us, values in zip(*columns.values(), strict=True)
         }
         T_of_frame = {f: T_of_start[us] for f, us in enumerate(self._starts_us) if us in T_of_start}
-        return {f: checks.of_frame(T_of_frame, f, "vehicle pose", where) for f in self.frames}
+        return {f: checks.find_entry(T_of_frame, f, "vehicle pose", where) for f in self.frames}
 
     @cached_property
     def _track(self) -> PoseTrack:
@@ -331,4 +336,4 @@ class Waymo(FileSequence):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         where = {CAMERA: CAMERAS.index(camera.name) + 1, STAMP: int(self._starts_us[number])}
         columns = self._segment.read("camera_image", {"image": "b"}, where)
-        return checks.decoded_image(columns["image"][0], camera, self._segment.file("camera_image"))
+        return checks.decode_rgb(columns["image"][0], camera, self._segment.file("camera_image"))

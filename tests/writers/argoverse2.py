@@ -34,7 +34,7 @@ def write_argoverse2(excerpt: Excerpt, out: Path) -> Path:
         returns, offset_ns = excerpt.returns(frame), excerpt.returns(frame).offset_ns + half_ns
         laser = returns.lidar * LASERS_PER_SCANNER + excerpt.rings(frame)
         fired = transform(T_EGO_LIDAR, excerpt.fired(frame))
-        points = track.compensated(fired, stamp_ns, offset_ns).astype(np.float16)
+        points = track.compensate(fired, stamp_ns, offset_ns).astype(np.float16)
         columns = {
             **dict(zip("xyz", points.T, strict=True)),
             "intensity": np.rint(returns.intensity * 255).astype(np.uint8),

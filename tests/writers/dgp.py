@@ -25,7 +25,7 @@ def write_dgp(excerpt: Excerpt, out: Path) -> Path:
     stamps_ns = [street.stamp_ns(frame) for frame in excerpt.frames]
     for frame, stamp_ns in zip(excerpt.frames, stamps_ns, strict=True):
         returns, file = excerpt.returns(frame), io.BytesIO()
-        points = excerpt.poses().compensated(excerpt.fired(frame), stamp_ns, returns.offset_ns)
+        points = excerpt.poses().compensate(excerpt.fired(frame), stamp_ns, returns.offset_ns)
         np.savez(file, data=np.column_stack([points, returns.intensity]))
         name = f"point_cloud/LIDAR/{stamp_ns // 100}.npz"
         put(folder / name, file.getvalue())

@@ -31,7 +31,7 @@ def write_odometry(excerpt: Excerpt, out: Path) -> Path:
     stamps_ns = [street.stamp_ns(frame) for frame in excerpt.frames]
     for number, frame in enumerate(excerpt.frames):
         offset_ns = excerpt.returns(frame).offset_ns
-        points = excerpt.poses().compensated(excerpt.fired(frame), stamps_ns[number], offset_ns)
+        points = excerpt.poses().compensate(excerpt.fired(frame), stamps_ns[number], offset_ns)
         put(sequence / "velodyne" / f"{number:06d}.bin", sweep_data(street, frame, points))
         for name in excerpt.cameras:
             put(sequence / "image_2" / f"{number:06d}.png", excerpt.png_image(name, frame))

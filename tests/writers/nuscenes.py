@@ -79,7 +79,7 @@ def _sweep(excerpt: Excerpt, frame: int, stamp_ns: int) -> tuple[Int, bytes]:
     late_ns = excerpt.street.stamp_ns(frame) - stamp_ns
     offset_ns = np.arange(num) // _RINGS * period_ns // num_columns - period_ns // 2 + late_ns
     offset_ns[rows] = returns.offset_ns + late_ns
-    stored = excerpt.poses(T_LIDAR_POINTS).compensated(points, stamp_ns, offset_ns)
+    stored = excerpt.poses(T_LIDAR_POINTS).compensate(points, stamp_ns, offset_ns)
     ring = np.arange(num) % _RINGS
     return rows, np.column_stack([stored, intensity, ring]).astype("<f4").tobytes()
 

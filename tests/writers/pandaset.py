@@ -31,7 +31,7 @@ def write_pandaset(excerpt: Excerpt, out: Path) -> Path:
     for number, frame in enumerate(excerpt.frames):
         stamp_ns, returns = int(stamps_ns[number]), excerpt.returns(frame)
         offset_ns = returns.offset_ns - half_ns
-        there = track.compensated(excerpt.fired(frame), stamp_ns, offset_ns)
+        there = track.compensate(excerpt.fired(frame), stamp_ns, offset_ns)
         world = poses.transform(track.at(stamp_ns), there)
         columns = dict(zip("xyz", world.T, strict=True))
         columns |= {"i": returns.intensity * 255.0, "t": (stamp_ns + offset_ns) * 1e-9}
