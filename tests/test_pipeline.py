@@ -119,11 +119,21 @@ def test_movers_are_moved_to_the_key(moving):
     assert strays.sum() < 0.02 * cloud.moving.sum()
 
 
-def test_the_published_engine_runs_too():
+def test_the_published_engine_runs_too_and_long_stages_count_their_parts():
     scene = Scene(World(street()), Arc(0, -1.5, 0, 5.0), Scanner(32, 300, (-15.0, 5.0)))
     sequence = TinySequence(scene, range(9))
     config = {**POSES_GIVEN, "objective": {"num_neighbors": 10}}
-    results = compare(sequence, 4, 1, config=config, methods=("none", "paper", "flow"))
+    reports = list[tuple[str, int, int]]()
+    results = compare(
+        sequence,
+        4,
+        1,
+        config=config,
+        methods=("none", "paper", "flow"),
+        progress=lambda *report: reports.append(report),
+    )
+    assert {("flow", 2, 3), ("deskew", 3, 3), ("project", 1, 1)} <= set(reports)
+    assert max(done for stage, done, _ in reports if stage == "read") > 1
     assert tuple(results["flow"].baselines) == ("none", "paper")
     assert len(results["flow"].cloud) == len(results["paper"].cloud)
     assert not results["flow"].cloud.moving.any()  # in a street where nothing moves

@@ -196,7 +196,10 @@ def _make_maps(
     scene: KeyScene, seen: SeenCloud, visible: bool, filled: bool
 ) -> dict[str, DepthMap]:
     """Return the depth maps of the points, limited to ``project.max_outliers``."""
-    depth = scene.views.depth_maps(seen, visible, filled)
+    depth = dict[str, DepthMap]()
+    for name in scene.watch.each("project", seen.in_view):
+        one = seen._replace(in_view={name: seen.in_view[name]})
+        depth |= scene.views.depth_maps(one, visible, filled)
     if visible:
         depth = _lower_confidence(scene, depth)
     max_outliers = scene.settings.project.max_outliers

@@ -90,8 +90,9 @@ class Road:
             with_window: Include the points of the window's own sweeps.
         """
         window_sweeps = self._thin_window()
+        sweeps_before, sweeps_after = sides = list[_RoadSweep](), list[_RoadSweep]()
         with ThreadPoolExecutor(num_threads()) as pool:
-            sweeps_before, sweeps_after = pool.map(self._collect_side, (-1, 1))
+            list(pool.map(partial(self._collect_side, sides), (-1, 1)))
         road = _RelaxedRoad([*sweeps_before[::-1], *window_sweeps, *sweeps_after], frozenset())
         # Odometry drifts along the road, recorded poses do not.
         has_odometry = bool(self._surfaces)
@@ -141,12 +142,12 @@ class Road:
                 road_sweeps.append(_RoadSweep(in_view, surface, travel_m, in_window=True))
         return road_sweeps
 
-    def _collect_side(self, side: int) -> list[_RoadSweep]:
-        """Return the sweeps before (side -1) or after (side 1) the window, nearest first."""
+    def _collect_side(self, sides: Sequence[list[_RoadSweep]], side: int) -> None:
+        """Collect the sweeps before (side -1) or after (side 1) the window, nearest first."""
         end_of_window = self.window.sweeps[0 if side < 0 else -1]
         begin_m = 0.0 if side < 0 else self._travel_m[-1]
         reach_m = self.far_m if self._is_seen(side) else _UNSEEN_SHARE * self.far_m
-        road_sweeps = list[_RoadSweep]()
+        most_sweeps = round(2 * self.far_m / _STEP_M)  # of both sides
         position = end_of_window.T_world_lidar[:3, 3]
         last_used_m = travel_m = 0.0  # both from the end of the window
         for registered, surface in self._register_side(side, reach_m):
@@ -157,8 +158,9 @@ class Road:
             last_used_m = travel_m
             in_view = self._select_in_view(registered)
             road_m = begin_m + side * travel_m
-            road_sweeps.append(_RoadSweep(in_view, surface, road_m, in_window=False))
-        return road_sweeps
+            sides[side > 0].append(_RoadSweep(in_view, surface, road_m, in_window=False))
+            num_sweeps = sum(map(len, sides))
+            self.sweeps.watch.report("far", num_sweeps, max(num_sweeps, most_sweeps))
 
     def _is_seen(self, side: int) -> bool:
         """Return True if a camera may see the road's end before (side -1) or after the window."""
