@@ -3,9 +3,9 @@
 
 python docs/make_pictures.py [NAME…] [--pandaset DIR] [--runs DIR]
 
-NAME: pandaset, street, reports, paper, notebook (default: all). Each key is densified once, into
-RUNS (default: ./densify-out/pictures). Finished runs there are drawn again as they are. pandaset
-needs --pandaset, the folder of sequence 002.
+NAME: pandaset, street, how, reports, paper, notebook (default: all). Each key is densified once,
+into RUNS (default: ./densify-out/pictures). Finished runs there are drawn again as they are.
+pandaset needs --pandaset, the folder of sequence 002.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
+import explained_scene
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
@@ -301,6 +302,15 @@ def make_street(runs: Path, pandaset: Path | None) -> None:
     write("limits", np.vstack(worst))
 
 
+def make_how(runs: Path, pandaset: Path | None) -> None:
+    """Draw the pictures at the beginning of how-it-works: evidence, rays, hulls."""
+    found = explained_scene.explained()
+    maps = (coloured(depth_m) for depth_m in (found.depth.depth_m, found.depth.filled_m))
+    write("how-evidence", explained_scene.evidence_picture(found))
+    write("how-rays", explained_scene.rays_picture(found))
+    write("how-hull", explained_scene.hull_picture(found, *maps))
+
+
 def make_reports(runs: Path, pandaset: Path | None) -> None:
     """Write two pages to turn around, with fewer points than `densify report` has."""
     report_page._MOST_POINTS = REPORT_POINTS
@@ -364,6 +374,7 @@ def make_notebook(runs: Path, pandaset: Path | None) -> None:
 MAKERS = {
     "pandaset": make_pandaset,
     "street": make_street,
+    "how": make_how,
     "reports": make_reports,
     "paper": make_paper,
     "notebook": make_notebook,
