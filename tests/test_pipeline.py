@@ -9,6 +9,7 @@ import pytest
 from densify.geometry import poses
 from densify.geometry.types import Reason, Result
 from densify.pipeline.key_result import METHODS
+from densify.pipeline.process import Watch
 from densify.pipeline.run import compare
 from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, street
 from tests.tiny_street import KEY, MOVERS, POSES_GIVEN, WINDOW, same_points, tiny
@@ -142,3 +143,15 @@ def test_the_published_engine_runs_too_and_long_stages_count_their_parts():
     assert (result.cloud.instance == -1).all()
     still = ~result.cloud.moving
     assert result.cloud.points[still].tobytes() == result.cloud.rigid_points[still].tobytes()
+
+
+def test_progress_returns_to_the_stage_that_still_runs() -> None:
+    reports = list[tuple[str, int, int]]()
+    watch = Watch(lambda *report: reports.append(report))
+    with watch.stage("flow"), watch.stage("ground"):
+        assert [*watch.each("ground", "ab")] == ["a", "b"]
+        with watch.stage("read", is_part=True):
+            pass
+    begun = [("flow", 0, 1), ("ground", 0, 1), ("ground", 1, 2), ("ground", 2, 2)]
+    assert reports == [*begun, ("ground", 1, 1), ("flow", 0, 1), ("flow", 1, 1)]
+    assert {cost.name for cost in watch.costs()} == {"flow", "ground", "read"}

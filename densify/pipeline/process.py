@@ -30,6 +30,7 @@ class Watch:
         self._progress = progress
         self._seconds: dict[str, float] = {}
         self._peak_mb: dict[str, float] = {}
+        self._running: list[str] = []  # stages, the latest last
         self._lock = threading.Lock()
         self._thread = threading.local()
 
@@ -37,9 +38,11 @@ class Watch:
     def stage(self, name: str, is_part: bool = False) -> Iterator[None]:
         """Measure the work inside the ``with`` block as the stage of this name.
 
-        Report its begin and its end, unless it is a part that `each` counts.
+        Report its begin and its end, unless it is a part that `each` counts. After its end, report
+        the stage that still runs in this or another thread.
         """
         if not is_part:
+            self._running.append(name)
             self.report(name, 0, 1)
         begin_s = time.perf_counter()
         # Time of the stages that the outer stage has called before this one
@@ -54,8 +57,12 @@ class Watch:
                 self._seconds[name] = self._seconds.get(name, 0.0) + own_s
                 self._peak_mb[name] = getrusage(RUSAGE_SELF).ru_maxrss / _PER_MB
             self._thread.inner_s = siblings_s + total_s
+            if not is_part:
+                self._running.remove(name)
         if not is_part:
             self.report(name, 1, 1)
+            for other in self._running[-1:]:
+                self.report(other, 0, 1)
 
     def each(self, name: str, parts: Collection[T]) -> Iterator[T]:
         """Yield the parts of a stage, and report how many of them are done."""
