@@ -20,11 +20,11 @@ from typing import Any
 
 from densify.bench import gate
 from densify.bench.verdicts import coverage, outliers_at
+from densify.scores.depth_metrics import LEAST_PIXELS
 
 ROOT = Path(__file__).resolve().parent.parent
 NUMBERS = ROOT / "docs/numbers.json"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
-LEAST_PIXELS = 200
 FIGURES = ("num_pixels", "num_compared", "coverage", "outliers", "outliers_1_px", "mae_m")
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 SIMPLER = ("single sweep", "single sweep, filled", "single sweep, IP-Basic", "rigid (ICP)")

@@ -30,6 +30,7 @@ class Watch:
         self._progress = progress
         self._seconds: dict[str, float] = {}
         self._peak_mb: dict[str, float] = {}
+        self._begin_s = time.perf_counter()
         self._running: list[str] = []  # stages, the latest last
         self._lock = threading.Lock()
         self._thread = threading.local()
@@ -73,8 +74,13 @@ class Watch:
     def restart(self) -> None:
         """Forget the costs measured until now, before the next key."""
         with self._lock:
+            self._begin_s = time.perf_counter()
             self._seconds.clear()
             self._peak_mb.clear()
+
+    def elapsed_s(self) -> float:
+        """Return the seconds since the begin, or since `restart`."""
+        return time.perf_counter() - self._begin_s
 
     def costs(self) -> tuple[StageCost, ...]:
         """Return the cost of each stage measured until now, repeated runs of a stage added up."""
