@@ -3,9 +3,9 @@
 
 python docs/make_pictures.py [NAME…] [--pandaset DIR] [--runs DIR]
 
-NAME: pandaset, street, reports, paper, notebook (default: all). Each key is densified once, into
-RUNS (default: ./densify-out/pictures). Finished runs there are drawn again as they are. pandaset
-needs --pandaset, the folder of sequence 002.
+NAME: pandaset, street, how, reports, paper, notebook (default: all). Each key is densified once,
+into RUNS (default: ./densify-out/pictures). Finished runs there are drawn again as they are.
+pandaset needs --pandaset, the folder of sequence 002.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
+import explained_scene
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
@@ -241,9 +242,20 @@ def remember(name: str, numbers: Mapping[str, Any]) -> None:
     NUMBERS.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n")
 
 
+def image_and_confidence(folder: Path, camera: str, width_px: int) -> list[Picture]:
+    """Return the image of the camera, and the confidence of the filled map."""
+    image = np.asarray(Image.open(folder / f"scene/image/{camera}.jpg").convert("RGB"))
+    confidence = read_stored(folder / f"confidence/{camera}.png", np.uint8, "a confidence")
+    shown = (image, "image"), (grey(confidence), "confidence")
+    return [titled(picture, name, width_px) for picture, name in shown]
+
+
 def draw_key(key: Key, folder: Path) -> None:
-    """Draw a key of the gallery."""
+    """Draw a key of the gallery; PandaSet's without its photographs."""
     maps, clouds = panels(folder, key.camera, 700), from_above(folder, 700)
+    if key in STREETS:
+        image, confidence = image_and_confidence(folder, key.camera, 700)
+        maps = [image, *maps, confidence]
     write(f"gallery-{key.name}", tiled([*maps, *clouds], 2))
     remember(key.name, scores(folder, key.camera))
 
@@ -293,12 +305,19 @@ def make_street(runs: Path, pandaset: Path | None) -> None:
         draw_key(key, folder := key.run(runs, None))
         worst.append(worst_place(folder, key.camera))
         if key is STREETS[0]:
-            maps = panels(folder, key.camera, 900)[2:]
-            confidence = read_stored(
-                folder / "confidence" / f"{key.camera}.png", np.uint8, "a confidence"
-            )
-            write("outputs", np.vstack([*maps, titled(grey(confidence), "confidence", 900)]))
+            image, confidence = image_and_confidence(folder, key.camera, 700)
+            maps = panels(folder, key.camera, 700)[2:]
+            write("outputs", tiled([image, *maps, confidence], 2))
     write("limits", np.vstack(worst))
+
+
+def make_how(runs: Path, pandaset: Path | None) -> None:
+    """Draw the pictures at the beginning of how-it-works: evidence, rays, hulls."""
+    found = explained_scene.explained()
+    maps = (coloured(depth_m) for depth_m in (found.depth.depth_m, found.depth.filled_m))
+    write("how-evidence", explained_scene.evidence_picture(found))
+    write("how-rays", explained_scene.rays_picture(found))
+    write("how-hull", explained_scene.hull_picture(found, *maps))
 
 
 def make_reports(runs: Path, pandaset: Path | None) -> None:
@@ -364,6 +383,7 @@ def make_notebook(runs: Path, pandaset: Path | None) -> None:
 MAKERS = {
     "pandaset": make_pandaset,
     "street": make_street,
+    "how": make_how,
     "reports": make_reports,
     "paper": make_paper,
     "notebook": make_notebook,

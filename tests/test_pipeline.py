@@ -9,6 +9,7 @@ import pytest
 from densify.geometry import poses
 from densify.geometry.types import Reason, Result
 from densify.pipeline.key_result import METHODS
+from densify.pipeline.process import Watch
 from densify.pipeline.run import compare
 from tests.scenes import CAMERA, SWEEP_S, Arc, Scanner, Scene, TinySequence, World, street
 from tests.tiny_street import KEY, MOVERS, POSES_GIVEN, WINDOW, same_points, tiny
@@ -119,11 +120,21 @@ def test_movers_are_moved_to_the_key(moving):
     assert strays.sum() < 0.02 * cloud.moving.sum()
 
 
-def test_the_published_engine_runs_too():
+def test_the_published_engine_runs_too_and_long_stages_count_their_parts():
     scene = Scene(World(street()), Arc(0, -1.5, 0, 5.0), Scanner(32, 300, (-15.0, 5.0)))
     sequence = TinySequence(scene, range(9))
     config = {**POSES_GIVEN, "objective": {"num_neighbors": 10}}
-    results = compare(sequence, 4, 1, config=config, methods=("none", "paper", "flow"))
+    reports = list[tuple[str, int, int]]()
+    results = compare(
+        sequence,
+        4,
+        1,
+        config=config,
+        methods=("none", "paper", "flow"),
+        progress=lambda *report: reports.append(report),
+    )
+    assert {("flow", 2, 3), ("deskew", 3, 3), ("project", 1, 1)} <= set(reports)
+    assert max(done for stage, done, _ in reports if stage == "read") > 1
     assert tuple(results["flow"].baselines) == ("none", "paper")
     assert len(results["flow"].cloud) == len(results["paper"].cloud)
     assert not results["flow"].cloud.moving.any()  # in a street where nothing moves
@@ -132,3 +143,15 @@ def test_the_published_engine_runs_too():
     assert (result.cloud.instance == -1).all()
     still = ~result.cloud.moving
     assert result.cloud.points[still].tobytes() == result.cloud.rigid_points[still].tobytes()
+
+
+def test_progress_returns_to_the_stage_that_still_runs() -> None:
+    reports = list[tuple[str, int, int]]()
+    watch = Watch(lambda *report: reports.append(report))
+    with watch.stage("flow"), watch.stage("ground"):
+        assert [*watch.each("ground", "ab")] == ["a", "b"]
+        with watch.stage("read", is_part=True):
+            pass
+    begun = [("flow", 0, 1), ("ground", 0, 1), ("ground", 1, 2), ("ground", 2, 2)]
+    assert reports == [*begun, ("ground", 1, 1), ("flow", 0, 1), ("flow", 1, 1)]
+    assert {cost.name for cost in watch.costs()} == {"flow", "ground", "read"}

@@ -86,7 +86,7 @@ def test_of_millions_of_records_few_are_parsed(tmp_path):
 def test_a_real_key_frame(test_data):
     sequence = open_sequence(test_data / "nuscenes")
     assert sequence.name == "scene-0061" and list(sequence.frames) == [0]
-    assert len(sequence.cameras) == 6
+    assert len(sequence.cameras) == 6 and next(iter(sequence.cameras)) == "CAM_FRONT"
     sweep = sequence[0]
     assert sweep.stamp_ns == 1_532_402_927_647_951_000
     assert sweep.row[-1] == 34_687 and len(sweep) == 34_688 - 4_393  # without a return

@@ -91,6 +91,7 @@ def test_a_real_sequence(test_data):
     assert list(sequence.image_stamps_ns("left_camera")) == list(range(9, 26))
     assert sequence.stamp_ns(10) == 1_557_539_957_500_393_000
     assert sequence.image_stamps_ns("front_camera")[10] == 1_557_539_957_450_529_000
+    assert next(iter(sequence.cameras)) == "front_camera"
     front = sequence.cameras["front_camera"]
     assert (front.width_px, front.height_px, front.K[0, 0]) == (1920, 1080, 1970.0131)
     # it hangs 9 cm before the scanner and 5 cm below it, and looks ahead

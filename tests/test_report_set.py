@@ -87,6 +87,8 @@ def test_pictures_show_filled_depth_and_confidence_and_lead_to_the_map(described
 
 def test_the_manifest_is_a_table(described: Path) -> None:
     write_manifest(described, *map(scored, FRAMES))
+    with pytest.raises(InputError, match=r"no key in manifest\*\.jsonl"):
+        densify.manifest(described.parent / "none")
     table = densify.manifest(described)
     assert list(table["key"]) == list(FRAMES) and (table["density.image_02"] == 0.5).all()
     assert table["ghost"].tolist() == [key % 4 / 100 for key in FRAMES]

@@ -20,10 +20,9 @@ from densify.config import as_mapping, resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.readers import open_sequence
-from densify.scores.depth_metrics import DepthErrors
+from densify.scores.depth_metrics import LEAST_PIXELS, DepthErrors
 
 _KEYS = [120]
-_LEAST_PIXELS = 200  # a share of fewer pixels is no result
 _UNSEEN = (
     "street?seed=41@70",
     "street:crossing?seed=42@90",
@@ -97,7 +96,7 @@ def answer_bench_baselines(options: argparse.Namespace) -> Iterator[Answer]:
 def _error_cells(errors: DepthErrors) -> list[str]:
     """Return cells of a table; a share of few pixels is not shown."""
     cells = [f"{errors.num_pixels:,}", percent(errors.coverage)]
-    if errors.num_compared < _LEAST_PIXELS or errors.mae_m is None:
+    if errors.num_compared < LEAST_PIXELS or errors.mae_m is None:
         return [*cells, "–", "–", "–"]
     shares = [percent(errors.outliers), percent(errors.outliers_1_px)]
     return [*cells, *shares, f"{errors.mae_m:.2f} m"]

@@ -39,6 +39,7 @@ from densify.pipeline.key_result import COMPARED
 from densify.readers import Spec, open_sequence
 from densify.readers.depth_trees import pair_depth_files
 from densify.readers.timeline import format_frames
+from densify.scores.depth_metrics import LEAST_PIXELS
 
 _FIRST_OF_RUN = {
     "report.html": "all of it, in a browser",
@@ -192,6 +193,9 @@ def _summary(result: Result) -> str:
         lines.append(f"ghosts of the accumulated points: {ghosts}")
     for name in result.depth:
         for pixels, where in (("all", ""), ("moving", ", on moving objects")):
+            num = look_up(result.metrics, "held_out", name, "measured", pixels, "num_compared")
+            if (num or 0) < LEAST_PIXELS:
+                continue
             if outliers := _beside_icp(result, "held_out", name, "measured", pixels, "outliers"):
                 lines.append(f"{name}, key held out: outliers{where}: {outliers}")
         if unjudged := look_up(result.metrics, "held_out", name, "unjudged"):
@@ -223,6 +227,7 @@ def _key_facts(result: Result) -> dict[str, Any]:
             "num_points": len(result.cloud),
             "num_moving": int(np.count_nonzero(result.cloud.moving)),
             "seconds": sum(cost.seconds for cost in result.costs),
+            "elapsed_s": round(result.elapsed_s, 3),
             "error": None,
             "density": metrics.get("density"),
             "ghosts": look_up(metrics, "ghosts", "all"),

@@ -201,6 +201,7 @@ def progress_on_stderr() -> Iterator[Progress]:
                     print(f"densify: {stage}, {done} of {total}", file=sys.stderr, flush=True)
                 return
             if done < bar.n or total != bar.total:  # another stage
+                bar.set_description(stage, refresh=False)
                 bar.reset(total)
                 bar.initial = done
             bar.n = done

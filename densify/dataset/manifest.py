@@ -111,6 +111,10 @@ def manifest(folder: str | Path) -> Any:
             by_camera = score if isinstance(score, Mapping) else {"": score}
             row |= {f"{name}.{camera}".rstrip("."): value for camera, value in by_camera.items()}
         rows.append(row)
+    if not rows:
+        raise InputError(
+            f"{folder}: no key in manifest*.jsonl; expected a folder that make_dataset wrote"
+        )
     return pandas.DataFrame(rows)
 
 

@@ -244,6 +244,7 @@ def _record(result: Result, config: Mapping[str, Any], data: str) -> dict[str, A
         },
         "warnings": result.warnings,
         "config": config,
+        "elapsed_s": round(result.elapsed_s, 3),
         "stages": [
             {
                 "name": c.name,

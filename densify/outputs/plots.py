@@ -169,6 +169,8 @@ def score_figure(title: str, unit: str, values: Float) -> str:
     histogram.set(ylabel=unit, xlabel="keys")
     timeline.plot(values, ".", color=_BLUE, markersize=4)
     timeline.set(title=title, xlabel="keys in order of recording and time")
+    for axes in (histogram, timeline):
+        axes.xaxis.get_major_locator().set_params(integer=True)
     file = io.StringIO()
     with rc_context({"svg.hashsalt": title}):  # equal figures have equal bytes
         figure.savefig(file, format="svg", metadata={"Date": None})

@@ -186,7 +186,7 @@ def key_page(files: KeyFiles, shown_folder: str) -> bytes:
         "sweeps": sweeps,
         "movers": [_mover(track, key) for track in tracks],
         "cloud": packed_points,
-        "about": {"stages": about.get("stages")},
+        "about": {"stages": about.get("stages"), "elapsed_s": about.get("elapsed_s")},
         "warnings": [str(warning) for warning in about.get("warnings") or ()],
         "missing": files.missing,
     }

@@ -197,7 +197,10 @@ def _make_maps(
     scene: KeyScene, seen: SeenCloud, visible: bool, filled: bool
 ) -> dict[str, DepthMap]:
     """Return the depth maps of the points, limited to ``project.max_outliers``."""
-    depth_maps = scene.views.depth_maps(seen, visible, filled)
+    depth_maps = dict[str, DepthMap]()
+    for name in scene.watch.each("project", seen.in_view):
+        of_one_map = seen._replace(in_view={name: seen.in_view[name]})
+        depth_maps |= scene.views.depth_maps(of_one_map, visible, filled)
     if visible:
         depth_maps = _lower_confidence(scene, depth_maps)
     max_outliers = scene.settings.project.max_outliers

@@ -7,14 +7,15 @@ import ctypes
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from resource import RUSAGE_SELF, getrusage
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from densify.geometry.types import Progress, StageCost
 
+T = TypeVar("T")
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # parameters of glibc's mallopt(3)
 _KEPT_BYTES = 2**30  # arrays up to this size are on the heap, which keeps as much freed memory
 _MOST_OF_OLDER_BYTES = 2**25  # older releases refuse a larger threshold of mmap
@@ -29,13 +30,21 @@ class Watch:
         self._progress = progress
         self._seconds: dict[str, float] = {}
         self._peak_mb: dict[str, float] = {}
+        self._begin_s = time.perf_counter()
+        self._running: list[str] = []  # stages, the latest last
         self._lock = threading.Lock()
         self._thread = threading.local()
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Measure the work inside the ``with`` block as the stage of this name."""
-        self._report(name, 0)
+    def stage(self, name: str, is_part: bool = False) -> Iterator[None]:
+        """Measure the work inside the ``with`` block as the stage of this name.
+
+        Report its begin and its end, unless it is a part that `each` counts. After its end, report
+        the stage that still runs in this or another thread.
+        """
+        if not is_part:
+            self._running.append(name)
+            self.report(name, 0, 1)
         begin_s = time.perf_counter()
         # Time of the stages that the outer stage has called before this one
         siblings_s = getattr(self._thread, "inner_s", 0.0)
@@ -49,13 +58,29 @@ class Watch:
                 self._seconds[name] = self._seconds.get(name, 0.0) + own_s
                 self._peak_mb[name] = getrusage(RUSAGE_SELF).ru_maxrss / _PER_MB
             self._thread.inner_s = siblings_s + total_s
-        self._report(name, 1)
+            if not is_part:
+                self._running.remove(name)
+        if not is_part:
+            self.report(name, 1, 1)
+            for other in self._running[-1:]:
+                self.report(other, 0, 1)
+
+    def each(self, name: str, parts: Collection[T]) -> Iterator[T]:
+        """Yield the parts of a stage, and report how many of them are done."""
+        for done, part in enumerate(parts, start=1):
+            yield part
+            self.report(name, done, len(parts))
 
     def restart(self) -> None:
         """Forget the costs measured until now, before the next key."""
         with self._lock:
+            self._begin_s = time.perf_counter()
             self._seconds.clear()
             self._peak_mb.clear()
+
+    def elapsed_s(self) -> float:
+        """Return the seconds since the begin, or since `restart`."""
+        return time.perf_counter() - self._begin_s
 
     def costs(self) -> tuple[StageCost, ...]:
         """Return the cost of each stage measured until now, repeated runs of a stage added up."""
@@ -65,11 +90,11 @@ class Watch:
             StageCost(name, self._seconds[name], peak_mb) for name, peak_mb in self._peak_mb.items()
         )
 
-    def _report(self, name: str, done: int) -> None:
-        """Report the begin (``done`` 0) or the end (1) of a stage."""
+    def report(self, name: str, done: int, total: int) -> None:
+        """Report that ``done`` of the ``total`` parts of a stage are done."""
         if self._progress is not None:
             with self._lock:
-                self._progress(name, done, 1)
+                self._progress(name, done, total)
 
 
 def keep_freed_memory() -> None:

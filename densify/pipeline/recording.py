@@ -280,7 +280,8 @@ class Recording:
         if engine is not None:
             with self._watch.stage("flow"):
                 motion = self.motion(key, engine)
-                fields = [motion.flow(frame, key) for frame in stretch.frames]
+                frames = self._watch.each("flow", stretch.frames)
+                fields = [motion.flow(frame, key) for frame in frames]
                 tracks = object_tracks(stretch, fields, key)
                 if with_flow:
                     flow = StretchFlow.towards(key, stretch, motion)
@@ -344,7 +345,7 @@ class Recording:
         """Return the sweeps that can be read, and the causes why others are left out, by frame."""
         sweeps: dict[int, Sweep] = {}
         left_out: dict[int, LeftOut] = {}
-        for frame in frames:
+        for frame in self._watch.each("read", frames):
             try:
                 self.sweeps.recorded_pose(frame)  # raises if the recording lacks the pose
                 sweeps[frame] = self.sweeps.read(frame)
@@ -391,11 +392,11 @@ class Recording:
 
     def _stretch(self, piece: Piece, frames: Sequence[int]) -> Stretch:
         """Return deskewed sweeps of a piece, in its world."""
-        for frame in frames:
-            if frame not in piece.deskewed:
-                sweep = self.sweeps.read(frame)
-                with self._watch.stage("deskew"):
-                    piece.deskewed[frame] = deskew([sweep], piece.poses).sweeps[0]
+        missing = [frame for frame in frames if frame not in piece.deskewed]
+        for frame in self._watch.each("deskew", missing):
+            sweep = self.sweeps.read(frame)
+            with self._watch.stage("deskew", is_part=True):
+                piece.deskewed[frame] = deskew([sweep], piece.poses).sweeps[0]
         return Stretch(tuple(piece.deskewed[frame] for frame in frames))
 
     @_latest

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import count
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -96,8 +97,9 @@ class Road:
         """
         # Collect and register the sweeps, in the order of the road.
         window_sweeps = self._thin_window()
+        numbers = count(1)  # of the sweeps of both sides, for the progress
         with ThreadPoolExecutor(num_threads()) as pool:
-            sweeps_before, sweeps_after = pool.map(self._collect_side, (-1, 1))
+            sweeps_before, sweeps_after = pool.map(partial(self._collect_side, numbers), (-1, 1))
         road = _RelaxedRoad([*sweeps_before[::-1], *window_sweeps, *sweeps_after], frozenset())
         # Odometry drifts along the road, recorded poses do not.
         has_odometry = bool(self._surfaces)
@@ -149,11 +151,12 @@ class Road:
                 road_sweeps.append(_RoadSweep(in_view, surface, travel_m, in_window=True))
         return road_sweeps
 
-    def _collect_side(self, side: int) -> list[_RoadSweep]:
+    def _collect_side(self, numbers: Iterator[int], side: int) -> list[_RoadSweep]:
         """Return the sweeps of one side of the window, nearest first, at least 1 m apart."""
         end_of_window = self.window.sweeps[0 if side < 0 else -1]
         end_travel_m = 0.0 if side < 0 else self._travel_m[-1]
         reach_m = self.far_m if self._may_see_end(side) else _UNSEEN_SHARE * self.far_m
+        max_sweeps = round(2 * self.far_m / _STEP_M)  # on both sides
         road_sweeps = list[_RoadSweep]()
         last_position = end_of_window.T_world_lidar[:3, 3]
         from_window_m = 0.0  # travel from the end of the window to the sweep
@@ -168,6 +171,8 @@ class Road:
             in_view = self._select_in_view(registered)
             travel_m = end_travel_m + side * from_window_m
             road_sweeps.append(_RoadSweep(in_view, surface, travel_m, in_window=False))
+            number = next(numbers)
+            self.sweeps.watch.report("far", number, max(number, max_sweeps))
         return road_sweeps
 
     def _may_see_end(self, side: int) -> bool:

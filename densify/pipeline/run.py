@@ -37,7 +37,6 @@ from densify.geometry.types import (
     LidarSequence,
     Progress,
     Result,
-    StageCost,
     StretchFlow,
 )
 from densify.pipeline.key_result import (
@@ -230,18 +229,21 @@ def densify(
             results_alone[-1] = complete_with_prior(
                 results_alone[-1], priors, shots, scene.truth, settings.prior.kind
             )
-    results = _with_baselines(results_alone, watch.costs(), sequence.name)
+    results = _with_baselines(results_alone, watch, sequence.name)
     return add_warnings(results, recording, key, shots)
 
 
-def _with_baselines(
-    results: Sequence[Result], costs: tuple[StageCost, ...], recording: str
-) -> dict[str, Result]:
+def _with_baselines(results: Sequence[Result], watch: Watch, recording: str) -> dict[str, Result]:
     """Return method -> result, each with the results before it as baselines."""
     by_method: dict[str, Result] = {}
+    costs, elapsed_s = watch.costs(), watch.elapsed_s()
     for result in results:
         by_method[result.method] = replace(
-            result, costs=costs, baselines=dict(by_method), recording=recording
+            result,
+            costs=costs,
+            elapsed_s=elapsed_s,
+            baselines=dict(by_method),
+            recording=recording,
         )
     return by_method
 

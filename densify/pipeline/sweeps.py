@@ -16,6 +16,7 @@ from densify.geometry.types import Float, Int, LidarSequence, Sweep
 from densify.pipeline.process import Watch
 from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
 
+_RENDERED_TOGETHER = 4  # sweeps of the street between two reports of progress
 BLOCK_S = 2.0
 """Greatest time from the first key of a block to its last."""
 
@@ -46,7 +47,7 @@ class Sweeps:
         self._settings = settings
         self._cache = cache
         self._run = run or uuid4().hex
-        self._watch = watch
+        self.watch = watch
         self._returns: dict[int, Int] = {}  # frame -> `count_by_azimuth`, of the sweeps read
         self.read = lru_cache(maxsize=num_kept)(self._read)
         self.content = lru_cache(maxsize=None)(self._content)
@@ -54,8 +55,10 @@ class Sweeps:
     def prepare(self, frames: Sequence[int]) -> None:
         """Let a recording that simulates its sweeps render these frames in parallel."""
         if hasattr(self._sequence, "prepare"):
-            with self._watch.stage("read"):
-                self._sequence.prepare(frames)
+            with self.watch.stage("read"):
+                for done in range(0, len(frames), _RENDERED_TOGETHER):
+                    self.watch.report("read", done, len(frames))
+                    self._sequence.prepare(frames[done : done + _RENDERED_TOGETHER])
 
     def recorded_pose(self, frame: int) -> Float | None:
         """Return the recording's ``T_world_lidar`` (4,4), None if the settings ignore it."""
@@ -67,7 +70,7 @@ class Sweeps:
         """Return a sweep. Raise InputError if it cannot be read."""
         if frame in self._timeline.unknown:
             raise InputError(self._timeline.unknown[frame])
-        with self._watch.stage("read"):
+        with self.watch.stage("read", is_part=True):
             sweep = read_sweep(self._sequence, frame, self._settings)
         self._returns[frame] = count_by_azimuth(sweep)
         return sweep

@@ -46,6 +46,7 @@ from densify.readers.recorded_poses import PoseTrack
 
 _COLUMN_NS = 46_080  # between two firings of an HDL-32E
 _NO_RETURN_M = 0.05
+_FIRST_CAMERA = "CAM_FRONT"
 _RECORD = re.compile(rb"\{[^{}]*\}")
 _LENGTH_WIDTH_HEIGHT = [1, 0, 2]  # of the table's width, length, height
 _EXPECTED = "a table of nuScenes: records of tokens, stamps and poses"
@@ -254,7 +255,9 @@ class NuScenes(FileSequence):
         with described_in(tables / "sample_data.json", _EXPECTED):
             records, self._ego = _read_path(tables, token, name)
             channels = _channels(tables, records)
-        lidars, self._images = channels["lidar"], dict(sorted(channels["camera"].items()))
+        lidars, names = channels["lidar"], sorted(channels["camera"])
+        names.sort(key=lambda name: name != _FIRST_CAMERA)
+        self._images = {name: channels["camera"][name] for name in names}
         if len(lidars) != 1:
             lidar_names = ", ".join(lidars) or "none"
             raise InputError(f"{root}: got the lidars {lidar_names} of {name}, expected one")

@@ -49,6 +49,7 @@ T_POSE_LIDAR[:3, 3] = _R_POSE_VEHICLE @ _POSITION_M
 """(4,4) pose of the lidar frame (Pandar64) in the vehicle frame of the pose files."""
 
 _LATEST_S = 4e9  # latest accepted stamp: the year 2096
+_FIRST_CAMERA = "front_camera"
 _CENTRE = tuple(f"position.{axis}" for axis in "xyz")
 _LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
 
@@ -78,7 +79,8 @@ class PandaSet(FileSequence):
         step_m = np.pad(step_m, 1, constant_values=np.inf)
         images, cameras, exposed_ns = {}, {}, {}
         self._T_world_cam: dict[str, Float] = {}
-        for folder in sorted(path.glob("camera/*")):
+        folders = sorted(path.glob("camera/*"))
+        for folder in sorted(folders, key=lambda folder: folder.name != _FIRST_CAMERA):
             name = folder.name
             files = checks.numbered_files(folder, ".jpg", ".png")
             if files:

@@ -24,6 +24,8 @@ OUTLIER_PX = 3.0
 OUTLIER_FRACTION = 0.05
 DECADES = 5.0
 """Confidence 1 means one outlier in 10^5 pixels; each 0.2 less means ten times as many."""
+LEAST_PIXELS = 200
+"""A share of fewer compared pixels is no result, and is not shown."""
 _DELTA = 1.25
 _RANGES_M = (0, 10, 20, 30, 50, 80)
 _EDGE_PX = 3

@@ -355,7 +355,8 @@ def in_one_line(sequence: LidarSequence) -> str:
     frames = sequence.frames
     cameras = ", ".join(sequence.cameras) or "none"
     span = f" from {frames[0]} to {frames[-1]}" if len(frames) else ""
-    return f"<{sequence.name}: {len(frames)} sweeps{span}; cameras: {cameras}>"
+    sweeps = "sweep" if len(frames) == 1 else "sweeps"
+    return f"<{sequence.name}: {len(frames)} {sweeps}{span}; cameras: {cameras}>"
 
 
 @dataclass(frozen=True)

@@ -327,7 +327,8 @@ class Result:
         cloud: Accumulated points at the key's time.
         depth: Map name -> depth map.
         metrics: Scores as plain numbers, ready for JSON.
-        costs: Wall time and memory of each stage.
+        costs: Wall time and memory of each stage. Stages overlap.
+        elapsed_s: Wall time of all stages together.
         baselines: Method -> result of a simpler method on the same registration.
         flow: Scene flow of every sweep to the next sweep towards the key (``output.flow``).
         movers: Instance -> points and maps of one moving object (``output.movers``).
@@ -355,6 +356,7 @@ class Result:
     depth: Mapping[str, DepthMap]
     metrics: Mapping[str, Any] = field(default_factory=dict)
     costs: tuple[StageCost, ...] = ()
+    elapsed_s: float = 0.0
     baselines: Mapping[str, Result] = field(default_factory=dict)
     flow: StretchFlow | None = None
     movers: Mapping[int, Mover] = field(default_factory=dict)

@@ -18,7 +18,7 @@ function facts() {
   const stages = Array.isArray(page.about.stages) ? page.about.stages : [];
   if (stages.length) {
     const peak = Math.max(...stages.map((s) => s.peak_memory_mb || 0));
-    fact("seconds", known(stages.reduce((a, s) => a + (s.seconds || 0), 0), (v) => v.toFixed(1)), `${(peak / 1000).toFixed(1)} GB at most`);
+    fact("seconds elapsed", known(page.about.elapsed_s, (v) => v.toFixed(1)), `${(peak / 1000).toFixed(1)} GB at most`);
   }
   $("facts").replaceChildren(...list);
 }

@@ -2,6 +2,7 @@
 // Scores and costs as tables.
 
 const PARTS = ["all", "moving", "static"];
+const LEAST_PIXELS = 200; // a share of fewer pixels is no result
 const SOURCES = [["depth", "Against the truth"], ["held_out", "Key sweep held out, against its own returns"]];
 
 function scoreTables(camera) {
@@ -39,7 +40,8 @@ function scoreTable(title, found, source, product, camera) {
   for (const [name, scores] of found) {
     const cells = parts.flatMap((part) => {
       const s = scores[source][camera][product][part] || {};
-      return [percent(s.outliers), metres(s.mae_m, 3), metres(s.rmse_m, 2), percent(s.coverage, 1)];
+      const errors = s.num_compared >= LEAST_PIXELS ? [percent(s.outliers), metres(s.mae_m, 3), metres(s.rmse_m, 2)] : ["–", "–", "–"];
+      return [...errors, percent(s.coverage, 1)];
     });
     table.append(methodRow(name, cells));
   }
@@ -60,7 +62,6 @@ function costs() {
     table.append(row(String(stage.name), numberCell(known(stage.seconds, (v) => v.toFixed(2))),
       element("td", {}, element("div", { class: "track" }, bar)), numberCell(known(stage.peak_memory_mb, (v) => `${whole(v)} MB`))));
   }
-  const total = stages.reduce((all, s) => all + (s.seconds || 0), 0);
-  table.append(row("together", numberCell(total.toFixed(2)), "", ""));
-  $("costs").append(table, element("p", { class: "small" }, "Wall seconds; stages of several methods run side by side, so they can add up to more than the run took."));
+  table.append(row("elapsed", numberCell(known(page.about.elapsed_s, (v) => v.toFixed(2))), "", ""));
+  $("costs").append(table, element("p", { class: "small" }, "Wall seconds. Stages overlap: together they can be longer than the elapsed time."));
 }

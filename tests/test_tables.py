@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: MIT
+"""The pages quote the figures of docs/numbers.json and tests/gate.json, and nothing else."""
+
+from __future__ import annotations
+
+import re
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+QUOTED = re.compile(r"\[(\d[^\]]*)\]\(([^)#]*)#([^)]*)\)")  # [20 s](results.md#cost)
+COST = re.compile(r"\d[\d.]* (?:s|minutes|GB|KISS)\b")
+
+
+@pytest.fixture(scope="module")
+def maker() -> Any:
+    spec = spec_from_file_location("make_tables", ROOT / "docs/make_tables.py")
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def section(page: Path, anchor: str) -> str:
+    """The text below the heading with this anchor."""
+    parts = re.split(r"^#+ (.*)\n", page.read_text(), flags=re.MULTILINE)
+    headings = (re.sub(r"[^\w -]", "", heading.lower()) for heading in parts[1::2])
+    return dict(zip((h.replace(" ", "-") for h in headings), parts[2::2], strict=True))[anchor]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_figures_are_those_of_their_table(page: Path, maker: Any) -> None:
+    text = page.read_text()
+    assert maker.with_tables(text) == text, "run: python docs/make_tables.py"
+    for figure, path, anchor in QUOTED.findall(text):
+        table = section(page.parent / path if path else page, anchor)
+        assert re.search(rf"(?<![\d.]){re.escape(figure)}(?![\d.])", table), (figure, path, anchor)
+
+
+@pytest.mark.parametrize("name", ("README.md", "docs/questions.md", "docs/first-recording.md"))
+def test_costs_are_links_to_their_table(name: str) -> None:
+    assert not COST.findall(QUOTED.sub("", (ROOT / name).read_text()))
+
+
+def test_a_share_of_few_pixels_is_no_figure(maker: Any) -> None:
+    cell = {"num_compared": 199, "coverage": 0.01, "outliers": 0.0, "mae_m": 0.1}
+    assert maker.all_errors(cell) == maker.share(cell, None) == "–"
