@@ -128,7 +128,7 @@ def test_messages_and_pages_name_what_can_be_installed() -> None:
     """``densify`` on the package index is another project."""
     extras = set(re.findall(r"^(\w+) = \[", (CHECKOUT / "pyproject.toml").read_text(), re.M))
     code, texts = "".join(CODE.values()), "".join((*CODE.values(), *PAGES.values()))
-    named = re.findall(r'(?:needed\("[\w.]+", |how_to_install\()["\'](\w+)', code)
+    named = re.findall(r'(?:import_extra\("[\w.]+", |how_to_install\()["\'](\w+)', code)
     assert not re.search(r"pip install '?densify\b(?!-lidar)", texts)
     named += re.findall(r"pip install '(?:densify-lidar|\.)\[([\w,]+)\]'", texts)
     assert len(named) > 15 and {e for names in named for e in names.split(",")} <= extras
