@@ -20,7 +20,7 @@ import densify
 from densify.config import resolve
 from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Obstacles
-from densify.flow.tracking.likelihood import own_table
+from densify.flow.tracking.likelihood import fitted_weights
 from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.ground import ground
 from densify.geometry.types import Stretch
@@ -109,7 +109,7 @@ def tried_in(stretch, heights, truth):
 
 def names():
     """Return the names of the terms."""
-    return [name for name in own_table() if name != "price"]
+    return [name for name in fitted_weights() if name != "price"]
 
 
 def fit(streets):

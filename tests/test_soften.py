@@ -105,11 +105,11 @@ def rigid(parts: list[Snapshot]) -> Softened:
 
 def forced(parts: list[Snapshot]) -> Softened:
     """At the softest, whatever held-out parts say."""
-    bending = module._Bending(tuple(parts))
+    bending = module._FlowSolver(tuple(parts))
     for level in range(len(module._ALPHAS)):
         bending.fill_targets()
         bending.refine(level)
-    bent = module._average_both_ways(tuple(parts), *bending.at_points())
+    bent = module._average_with_reverse(tuple(parts), *bending.at_points())
     return Softened(tuple(parts), *bent, module._ALPHAS[-1], {})
 
 
@@ -240,7 +240,7 @@ def test_a_solve_minimises_what_the_docstring_says(monkeypatch):
     monkeypatch.setattr(module, "_MAX_PRODUCTS", 2000)
     rng = np.random.default_rng(3)
     parts = tuple(Snapshot(rng.random((12, 3)), t) for t in (0.0, 0.1, 0.3))
-    bending = module._Bending(parts)
+    bending = module._FlowSolver(parts)
     n = len(bending._source)
     pull = rng.normal(size=(n, 3))
     monkeypatch.setattr(module, "_ANCHOR", 0.0)

@@ -14,9 +14,9 @@ from densify.flow.tracking.likelihood import (
     Evidence,
     Places,
     Violations,
-    find_places_left,
+    count_vacated_places,
+    fitted_weights,
     judge,
-    own_table,
 )
 from densify.flow.tracking.objects import MovingObject, Observation, Shape, Track
 from densify.flow.tracking.tracks import find_tracks
@@ -67,7 +67,7 @@ SURE = Evidence(Violations(200, 0, 300), Places(0, 100), Places(0, 100), 30.0, 0
 
 
 def odds(**changed: object) -> float:
-    return SURE._replace(**changed).log_odds(own_table())
+    return SURE._replace(**changed).log_odds(fitted_weights())
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_each_term_speaks_against_a_track(worse):
 def test_what_is_confirmed(evidence, moves):
     violations, before, after, *rest = evidence
     found = Evidence(Violations(*violations), Places(*before), Places(*after), *rest)
-    assert (found.log_odds(own_table()) > 0) == moves
+    assert (found.log_odds(fitted_weights()) > 0) == moves
 
 
 def test_two_states_confirm_nothing():
@@ -138,7 +138,7 @@ def test_the_weights_separate_the_tracks_of_a_street_that_had_no_part_in_the_fit
             for i, rows in track.claimed.items()
         ]
         shares.append(np.concatenate(on).mean())
-        log_odds.append(evidence.log_odds(own_table()))
+        log_odds.append(evidence.log_odds(fitted_weights()))
 
     find_tracks(obstacles, space, heights, record=record)
     share, moves = np.array(shares), np.array(log_odds) > 0
@@ -180,7 +180,7 @@ class Seen:
     def places(self, track: Track, *known: Track) -> np.ndarray:
         """[before, after] × [taken, empty]"""
         objects = [MovingObject(t, Shape.of(t.points_in(self.obstacles, t.claimed))) for t in known]
-        return np.array(find_places_left(track, self.obstacles, self.space, objects, 0.2))
+        return np.array(count_vacated_places(track, self.obstacles, self.space, objects, 0.2))
 
 
 def test_a_fence_does_not_move():

@@ -13,7 +13,7 @@ from densify.geometry.types import Float
 
 def _nearness(field: DistanceField, group: Group, velocities: Float) -> Float:
     found = np.zeros((len(velocities), len(group.points)), np.uint8)
-    field.raise_to(found, group, velocities)
+    field.raise_nearness(found, group, velocities)
     return found / 255
 
 

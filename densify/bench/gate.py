@@ -352,7 +352,7 @@ class _Moved(Recording):
         registration = self._still.registration(number)
         rng = np.random.default_rng(self._seed)
         pieces = tuple(_jittered(piece, rng) for piece in registration.pieces)
-        return Registration(pieces, registration.bad)
+        return Registration(pieces, registration.left_out)
 
 
 def _jittered(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:

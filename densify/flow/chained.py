@@ -40,7 +40,7 @@ class ChainedMotion:
         return self._zero_flow(i) if i == j else self._flow(i, j)
 
     def _zero_flow(self, i: int) -> FlowField:
-        """Return the flow of sweep index i to itself: 0, with the moving points of a step."""
+        """Return the flow of sweep index i to itself: 0, with labels of the step to a neighbour."""
         num_sweeps = len(self.stretch.sweeps)
         if num_sweeps == 1:
             return FlowField.zero(len(self.stretch.sweeps[i].sweep))
@@ -82,17 +82,19 @@ class ChainedMotion:
             if not len(rows_k):
                 lost[rows] = True
                 continue
+            # Where the step brings the points of sweep i, and the object's nearest points there
             arrived = poses.transform(T_k_i, sweep_i.sweep.points[rows] + step.total[rows])
             members_k = points_k[rows_k]
             gap_m, nearest = nearest_k(tree_of(members_k), arrived, _NUM_NEIGHBORS)
-            weight = 1 / (gap_m + 1e-3)
+            weight = 1 / (gap_m + 1e-3)  # 1 mm avoids a division by 0
             weight /= weight.sum(axis=1, keepdims=True)
+            # Their motion from sweep k on: rigid, plus what the nearest points deviate from it
             if instance >= 0:
                 target = members_k + flow_k.displacement[rows_k]
                 T = _object_motion(members_k, target)
                 rigid_flow = poses.transform(T, arrived) - arrived
                 deviation = target - poses.transform(T, members_k)
-            else:  # moving points without an object
+            else:  # instance -1: moving points without an object
                 rigid_flow = np.zeros_like(arrived)
                 deviation = flow_k.displacement[rows_k]
                 lost[rows[gap_m[:, 0] > _MAX_GAP_M]] = True

@@ -47,6 +47,9 @@ def energy(
         target: (m,3) metres, points q, in the frame of the source.
         laplacian: (n,n) L of `densify.flow.graph.laplacian`.
         alpha: Weight of smoothness.
+
+    Raises:
+        InputError: A shape does not fit, or a cloud is empty or not finite.
     """
     if flow.shape != source.shape:
         raise InputError(
@@ -72,12 +75,12 @@ def energy(
 @contextmanager
 def on_one_thread() -> Iterator[None]:
     """Run torch on one thread inside the block: its sums depend on the thread count."""
-    before = torch.get_num_threads()
+    num_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(num_threads)
 
 
 class _QuadraticForm(torch.autograd.Function):

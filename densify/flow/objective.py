@@ -85,6 +85,9 @@ def solve(
         source: (n,3) metres.
         target: (m,3) metres, in the same frame.
         initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
+
+    Raises:
+        InputError: A shape does not fit, or a cloud is empty or not finite.
     """
     settings = settings or SolverSettings()
     points = checked_cloud(source, "source")
@@ -92,18 +95,19 @@ def solve(
     start = np.zeros_like(points) if initial is None else checked_cloud(initial, "initial")
     if start.shape != points.shape:
         raise InputError(f"initial: got shape {start.shape}, expected the source's {points.shape}")
-    graph_laplacian = laplacian(knn_graph(points, settings.num_neighbors))
+    L = laplacian(knn_graph(points, settings.num_neighbors))
+    # Relative to the mean, large coordinates of a map lose no accuracy.
     origin = points.mean(axis=0)
     points, target_points = points - origin, target_points - origin
     if settings.solver == "adam":
-        return _solve_by_adam(points, target_points, graph_laplacian, start, settings)
-    problem = _Problem(points, target_points, graph_laplacian, settings.alpha)
+        return _solve_by_adam(points, target_points, L, start, settings)
+    problem = _Problem(points, target_points, L, settings.alpha)
     first_alpha = settings.alpha if initial is not None else _FIRST_ALPHA
-    return _solve_by_pcg(problem, start, _levels(first_alpha, settings.alpha))
+    return _solve_by_pcg(problem, start, _descending_alphas(first_alpha, settings.alpha))
 
 
 def _solve_by_adam(
-    source: Float, target: Float, smooth: csr_array, start: Float, settings: SolverSettings
+    source: Float, target: Float, L: csr_array, start: Float, settings: SolverSettings
 ) -> Solution:
     """Return the solution by Adam, the published protocol, keeping the best flow of all steps."""
     import torch
@@ -115,14 +119,14 @@ def _solve_by_adam(
         points = torch.from_numpy(source)
         target_points = torch.from_numpy(target)
         optimizer = torch.optim.Adam([flow], lr=_LEARNING_RATE_M)
-        value = energy(flow, points, target_points, smooth, settings.alpha)
+        value = energy(flow, points, target_points, L, settings.alpha)
         best_flow, best = flow.detach().clone(), value
         energies = [value.total.item()]
         for _ in range(settings.adam_num_steps):
             optimizer.zero_grad()
             value.total.backward()
             optimizer.step()
-            value = energy(flow, points, target_points, smooth, settings.alpha)
+            value = energy(flow, points, target_points, L, settings.alpha)
             if value.total.item() < best.total.item():
                 best_flow, best = flow.detach().clone(), value
             energies.append(value.total.item())
@@ -158,13 +162,13 @@ class _Value:
 class _Problem:
     """A pair of clouds relative to the mean of the source, with the Laplacian and alpha."""
 
-    def __init__(self, source: Float, target: Float, smooth: csr_array, alpha: float) -> None:
+    def __init__(self, source: Float, target: Float, L: csr_array, alpha: float) -> None:
         self.source = source
         self.target = target
         self.target_tree = cKDTree(target)
-        self.laplacian = smooth
+        self.laplacian = L
         self.alpha = alpha
-        self.diagonal = smooth.diagonal()
+        self.diagonal = L.diagonal()
 
 
 def _solve_by_pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
@@ -177,7 +181,8 @@ def _solve_by_pcg(problem: _Problem, start: Float, levels: list[float]) -> Solut
         is_last = number == len(levels) - 1
         for _ in range(_MAX_LAST_ALTERNATIONS if is_last else _MAX_ALTERNATIONS):
             previous_energy = value.at(alpha)
-            # With fixed matches, a quadratic bounds the energy above, tight at the current flow.
+            # With fixed matches the energy is a quadratic. It is never below the true energy, and
+            # equals it at the current flow: a step that lowers the quadratic lowers the energy.
             value = _Value(problem, value.flow + _step(problem, value, alpha))
             energies.append(value.total)
             if previous_energy - value.at(alpha) <= _LEVEL_TOLERANCE * value.at(alpha):
@@ -211,12 +216,12 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
     return step.reshape(shape)
 
 
-def _levels(first: float, alpha: float) -> list[float]:
-    """Return alphas from ``first`` down to ``alpha``, in equal steps of the logarithm."""
+def _descending_alphas(first: float, alpha: float) -> list[float]:
+    """Return alphas from ``first`` down to ``alpha``, in equal factors of at most 10^(2/3)."""
     lowest_alpha = max(alpha, _LEAST_ALPHA)
     if first <= lowest_alpha:
         return [alpha]
-    # 1e-9: rounding must not add a step to a whole number of them.
+    # Without the 1e-9, rounding could add a step where the number is an integer.
     num_steps = math.ceil(math.log(first / lowest_alpha) / math.log(_LEVEL_FACTOR) - 1e-9)
     return [*np.geomspace(first, lowest_alpha, num_steps + 1)[:-1].tolist(), alpha]
 

@@ -39,7 +39,7 @@ MISSING = 3.0
 """Cost of a point without surface, and greatest cost."""
 _MIN_NEIGHBORS = 3
 _NOISE_M = 0.1  # noise of a point and of level ground; a closer point is a counterpart
-_EVEN_M = 0.15  # voxel in which one point is kept, because points are denser along rings
+_THINNING_M = 0.15  # voxel in which one point is kept, because points are denser along rings
 
 
 @dataclass(frozen=True)
@@ -57,22 +57,22 @@ class PairCloud:
         return Strips(self.points)
 
     @cached_property
-    def _even(self) -> Bool:
+    def _is_kept(self) -> Bool:
         """(N,) True for the only point that is kept in its voxel of 0.15 m."""
-        even = np.zeros(len(self.points), bool)
-        even[thinned(self.points, np.arange(len(even)), _EVEN_M, 1)] = True
-        return even
+        is_kept = np.zeros(len(self.points), bool)
+        is_kept[thinned(self.points, np.arange(len(is_kept)), _THINNING_M, 1)] = True
+        return is_kept
 
-    def evenly(self, rows: Int) -> Int:
+    def thin(self, rows: Int) -> Int:
         """Return those of the given rows that are kept, at most one in each voxel of 0.15 m."""
-        return rows[self._even[rows]]
+        return rows[self._is_kept[rows]]
 
     def rows_around(self, points: Float) -> Int:
-        """Return the even rows in the box around points (K,3), or within `SURFACE_M` of it."""
+        """Return the thinned rows in the box around points (K,3), or within `SURFACE_M` of it."""
         if not len(points):
             return np.zeros(0, np.int64)
         low, high = points.min(axis=0) - SURFACE_M, points.max(axis=0) + SURFACE_M
-        return self.evenly(self.strips.rows_inside(low, high))
+        return self.thin(self.strips.rows_inside(low, high))
 
 
 class Surface:
@@ -93,7 +93,7 @@ class Surface:
         on_surface = np.flatnonzero(exists.sum(axis=1) >= _MIN_NEIGHBORS)
         exists = exists[on_surface]
         neighbour = np.where(exists, np.asarray(neighbour)[on_surface], 0)
-        # The normal distribution of the neighbours
+        # Normal distribution of the neighbours that exist
         weight = exists / exists.sum(axis=1, keepdims=True)
         arms = self._points[neighbour]
         mean = np.einsum("nk,nki->ni", weight, arms)
@@ -113,8 +113,9 @@ _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and h
 def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
     """Return (N,) True for points without a counterpart: no other surface or point in 0.1 m."""
     unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _NOISE_M))
-    surface = Surface(other_cloud.points[other_cloud.evenly(np.arange(len(other_cloud.points)))])
+    surface = Surface(other_cloud.points[other_cloud.thin(np.arange(len(other_cloud.points)))])
     unexplained = np.zeros(len(cloud.points), bool)
+    # A cost of 1.5 is a distance of 1.7 standard deviations from the surface.
     unexplained[unmatched] = surface.cost(cloud.points[unmatched]) > MISSING / 2
     return unexplained
 
@@ -133,13 +134,13 @@ def group_around(points: Float, unexplained: Bool) -> Int:
     is_vehicle_sized = np.linalg.norm(high - low, axis=1) <= _MAX_EXTENT_M
     long_rows = np.flatnonzero(~is_vehicle_sized[group])
     _, cluster = cluster_around(points[long_rows], unexplained[long_rows])
-    # Labels from num_groups on are in use for no other group.
+    # No group has a label of num_groups or more.
     label = group.copy()
     label[long_rows] = np.where(cluster >= 0, num_groups + cluster, -1)
     return label
 
 
-def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
+def find_road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
     """Return the rows of each group that may be a road user, and not a treetop or a wall.
 
     Args:
@@ -163,13 +164,14 @@ def road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
 # Time between the clouds: assumed if unknown, and the longest that is searched
 _USUAL_S, _LONGEST_S = 0.1, 0.4
 MIN_MOTION_M = 0.1  # a shorter motion, or difference of two, may be an error of registration
-_NUM_STARTS, _APART_M = 5, 0.5  # displacements from the vote, and their least distance
-_PER_M = 1e-3  # loss of the vote per metre: of equal displacements the shortest is taken
+_NUM_VOTED, _APART_M = 5, 0.5  # displacements from the vote, and their least distance
+_PER_M = 1e-3  # loss of the vote per metre: of displacements with equal score the shortest wins
 _REFINE_M = (0.08, 0.04, 0.02)  # steps of the refinement
 _YAW_PER_M = 0.25  # rad: 4 m from the centre, a point moves by the same step
-_START_M = 1.0  # standard deviation of a voted displacement
+_START_M = 1.0  # standard deviation of a voted displacement: it hardly constrains the alignment
 _MIN_GAIN = 10.0  # least log-likelihood ratio in each cloud: thousands of motions are tried
-_BALANCE = 0.25  # least gain of the target points, relative to the source: both are one object
+# Least gain of the target points, relative to that of the source points: both show the same object.
+_MIN_TARGET_SHARE = 0.25
 _MAX_MISFIT = 1.7  # greatest mean cost of the moved points
 # Greatest thickness (RMS) of a wall, and greatest share of the motion across it
 _WALL_M, _WALL_ACROSS = 0.05, 0.3
@@ -231,8 +233,9 @@ class Proposal:
         """
         counted_gain = self.target_gain
         if free is not None:
+            # Evidence against the motion always counts, also from points of another motion.
             counted_gain = self.target_gain[free | (self.target_gain < 0)]
-        min_gain = max(_MIN_GAIN, _BALANCE * self.source_gain)
+        min_gain = max(_MIN_GAIN, _MIN_TARGET_SHARE * self.source_gain)
         is_explained = self.source_gain > _MIN_GAIN and counted_gain.sum() > min_gain
         return bool(is_explained and self.misfit < _MAX_MISFIT)
 
@@ -251,7 +254,7 @@ def judge(
         motion: Motion of the group that is judged.
     """
     static = replace(motion, state=np.zeros(4))
-    members = source.evenly(members)
+    members = source.thin(members)
     static_cost, static_rows = compare(source, members, target, static)
     moved_cost, moved_rows = compare(source, members, target, motion)
     rows = np.union1d(static_rows, moved_rows)
@@ -275,7 +278,7 @@ def judge(
 def compare(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Compare source points with the target's surfaces, which are moved back by a motion.
+    """Return how well source points fit the target's surfaces, moved back by a motion.
 
     Args:
         members: (K,) rows of the source points.
@@ -284,6 +287,7 @@ def compare(
         The (K,) costs of the source points, and the indices of the target points that come close
             to the source points when they are moved back.
     """
+    # The target fires over some time. The box holds the group at its first and last firing time.
     points = motion.at_start(source, members)
     positions = [motion.place(points, share) for share in (target.share.min(), target.share.max())]
     rows = target.rows_around(np.concatenate(positions))
@@ -305,7 +309,7 @@ class Search:
     initial: Float | None
 
     def proposals(self, group: int, members: Int) -> list[Proposal]:
-        """Return the motions by which a group may move, with their evidence.
+        """Return the motions that both clouds clearly support for a group, with their evidence.
 
         Args:
             group: Index of the group.
@@ -328,7 +332,7 @@ class Search:
         displacements += self._vote(members, rows, slope, reach_m)
         judged = list[Proposal]()
         for state in self._align_all(displacements, centre, members, rows):
-            state[2] = state[:2] @ slope
+            state[2] = state[:2] @ slope  # the group stays on the ground
             moved_m = np.linalg.norm(state[:2])
             if MIN_MOTION_M < moved_m <= limit_m and not _is_ambiguous(points, state[:3]):
                 motion = RigidMotion(state, centre)
@@ -350,6 +354,7 @@ class Search:
         x, y = proposal.motion.state[:2] / np.linalg.norm(proposal.motion.state[:2])
         axes = np.array([[x, y, 0, 0], [-y, x, 0, 0], [0, 0, 0, _YAW_PER_M]])
         for step_m in _REFINE_M:
+            # Steps are taken as long as one of them raises the gain.
             previous = None
             while previous is not proposal:
                 previous = proposal
@@ -372,10 +377,11 @@ class Search:
         displacements = displacements[np.hypot(*displacements.T) <= reach_m]
         displacements = np.column_stack([displacements, displacements @ slope])
         nearness = np.zeros((len(displacements), len(group.points)), np.uint8)
-        field.raise_to(nearness, group, displacements)
+        field.raise_nearness(nearness, group, displacements)
         score = nearness.mean(axis=1) / 255 - _PER_M * np.linalg.norm(displacements, axis=1)
+        # The best displacement, then the best of those at least 0.5 m away from it, and so on
         voted = []
-        for _ in range(_NUM_STARTS):
+        for _ in range(_NUM_VOTED):
             voted.append(displacements[np.argmax(score)])
             score[np.linalg.norm(displacements - voted[-1], axis=1) < _APART_M] = -1.0
         return voted
@@ -394,8 +400,8 @@ class Search:
 
     def _align(self, start: RigidMotion, members: Int, rows: Int) -> Float | None:
         """Return the state (4,) that aligns members with target rows, None for too few matches."""
-        model = Model(start.at_start(self.source, self.source.evenly(members)))
-        target_points = start.at_start(self.target, self.target.evenly(rows))
+        model = Model(start.at_start(self.source, self.source.thin(members)))
+        target_points = start.at_start(self.target, self.target.thin(rows))
         is_close = _in_box(target_points, model.points, GATES_M[0])
         arrived = start.place(target_points[is_close], 1.0)
         if len(arrived) < MIN_FIT:
@@ -422,6 +428,7 @@ def _slope_of(ground: HeightMap, position: Float) -> Float:
     steps = np.arange(-_SLOPE_STEPS, _SLOPE_STEPS + 1) * _SLOPE_STEP_M
     offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     height_m = ground.under(position[:2] + offset)
+    # Least squares: the grid is symmetric, hence both axes are independent.
     height_m -= height_m.mean()
     slope: Float = offset.T @ height_m / (offset**2).sum(axis=0)
     # A cloud without ground points has no plane ground.
@@ -430,13 +437,16 @@ def _slope_of(ground: HeightMap, position: Float) -> Float:
 
 
 def _is_ambiguous(points: Float, displacement: Float) -> bool:
-    """Return True if the moved group could be another part of the same wall or rail."""
+    """Return True if a static wall or rail, seen at another part, could explain the motion."""
     _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     length_m, width_m, thickness_m = scale / np.sqrt(len(points))  # RMS along the three axes
     moved_m = np.linalg.norm(displacement)
-    if width_m < _RAIL_M and abs(axes[0, 2]) < _RAIL_RISE:  # a rail, or the back of a far car
+    if width_m < _RAIL_M and abs(axes[0, 2]) < _RAIL_RISE:
+        # Any motion may lead to another part of a rail. The back of a far car looks alike, but is
+        # ambiguous only along itself.
         is_far_car = len(points) < _MAX_BACK_POINTS and length_m < _MAX_BACK_M
         return bool(not is_far_car or abs(axes[0] @ displacement) > _RAIL_ALONG * moved_m)
+    # Along a wall the motion may lead to another part of it. For points on a line any motion may.
     is_along_wall = abs(axes[-1] @ displacement) < _WALL_ACROSS * moved_m
     return bool(thickness_m < _WALL_M and (is_along_wall or width_m < _WALL_M))
 
@@ -464,34 +474,36 @@ def find_movers(
     Returns:
         The motions, and (N,) the index of each source point's motion, -1 for static points.
     """
+    # Proposals of all groups, then the best consistent ones, refined
     clouds = source, target
     with ThreadPoolExecutor(2) as pool:
         unexplained = list(pool.map(find_unexplained, clouds, clouds[::-1]))
         points = [cloud.points for cloud in clouds]
         group, target_group = pool.map(group_around, points, unexplained)
-        members = road_users(group, unexplained[0], height_m)
+        members = find_road_users(group, unexplained[0], height_m)
         search = Search(source, target, target_group >= 0, ground, apart_s, initial)
         proposals = list(chain(*pool.map(search.proposals, range(len(members)), members)))
-        chosen = _choose(proposals, len(target.points))
+        chosen = _select_motions(proposals, len(target.points))
         chosen_members = [members[proposal.group] for proposal in chosen]
         refined = list(pool.map(search.refine, chosen, chosen_members))
     instance = np.full(len(source.points), -1)
     for k, proposal in enumerate(refined):
         instance[members[proposal.group]] = k
     for k, proposal in enumerate(refined):
-        _attach(k, proposal.motion, instance, source, target)
+        _claim_fitting_points(k, proposal.motion, instance, source, target)
     return [proposal.motion for proposal in refined], instance
 
 
-def _choose(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
+def _select_motions(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
     """Return at most one proposal per group; a target point is explained by one motion only."""
     chosen: dict[int, Proposal] = {}
     explained_by = np.full(num_targets, -1)  # index in ``chosen``
     for i in np.argsort(-_gain_with_neighbours(proposals), kind="stable"):
         proposal = proposals[i]
-        # Two scanners see one object at two positions, hence its groups may share target points.
+        # A target point is evidence for a second motion only if both motions are alike: two
+        # scanners see one object at two positions, and its two groups may share target points.
         differs = [not proposal.moves_like(earlier) for earlier in chosen.values()]
-        # The last entry, of index -1, stands for points that no motion explains.
+        # The last entry, at index -1, is for points that no motion explains.
         free = ~np.array([*differs, False])[explained_by[proposal.rows]]
         if proposal.group not in chosen and proposal.moves(free):
             explained_by[proposal.rows[proposal.target_gain > 0]] = len(chosen)
@@ -500,13 +512,13 @@ def _choose(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
 
 
 def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
-    """Return the (P,) gain of each proposal, plus that of groups beside it that may move alike."""
+    """Return the (P,) gain of each proposal plus that of groups within 5 m that may move alike."""
     # Two scanners see one car at two positions. A motion of half the speed could move the car from
     # the second position to the first one, but would not fit the group at the first position.
     centres = np.array([proposal.motion.centre for proposal in proposals]).reshape(-1, 3)
     total = np.zeros(len(proposals))
     for i, proposal in enumerate(proposals):
-        gains = dict[int, float]()
+        gains = dict[int, float]()  # best gain of each group
         for j in np.flatnonzero(np.linalg.norm(centres - centres[i], axis=1) < _BESIDE_M):
             neighbour = proposals[j]
             if neighbour.moves_like(proposal):
@@ -515,10 +527,10 @@ def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
     return total
 
 
-def _attach(
+def _claim_fitting_points(
     k: int, motion: RigidMotion, instance: Int, source: PairCloud, target: PairCloud
 ) -> None:
-    """Assign source points within 1 m that fit the motion better than static to group k."""
+    """Assign static points within 1 m of group k to it, in place, if they fit its motion better."""
     members = source.points[instance == k]
     low, high = members.min(axis=0) - SURFACE_M, members.max(axis=0) + SURFACE_M
     rows = source.strips.rows_inside(low, high)

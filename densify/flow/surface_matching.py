@@ -63,6 +63,7 @@ def surface_information(points: Float, rows: Int, loose: float = 1.0) -> Float:
     offset = points[rows]
     offset -= offset.mean(axis=1, keepdims=True)
     covariance = loose / rows.shape[1] * (offset.transpose(0, 2, 1) @ offset)
+    # The ridge keeps the covariance invertible where all neighbours lie on a line or in a plane.
     ridge = _SURFACE_M**2 + _RIDGE / 3 * np.trace(covariance, axis1=1, axis2=2)
     return np.asarray(np.linalg.inv(covariance + ridge[:, None, None] * np.eye(3)))
 
@@ -112,7 +113,7 @@ class Model:
             if num < MIN_FIT:
                 return None
             weight = min(1.0, MAX_WEIGHT / num)
-            # The prediction counts as one more match.
+            # The prediction is one more measurement, with the inverse variances ``prior``.
             H = weight * H + np.diag(prior)
             g = weight * g + prior * (predicted - state)[[0, 1, 3]]
             state[[0, 1, 3]] += np.linalg.solve(H, g)
@@ -179,7 +180,8 @@ def _add_matches(
         if row < 0:
             continue
         num += 1
-        # Gauss-Newton, with Tukey's weight
+        # Gauss-Newton with Tukey's weight: H += w Jᵀ A J, g += w Jᵀ A residual. A motion of the
+        # object moves ``in_object`` by -J, hence g is the descent direction.
         A = information[row]
         weight = (1 - squared / gate_m**2) ** 2
         J[0, 2] = -arm[1]

@@ -65,6 +65,9 @@ def estimate_flow(
     Returns:
         Flow from the middle of the source's times to the target's middle, in the common frame. With
             times, ``to_reference`` is the motion from a point's own time to the source's middle.
+
+    Raises:
+        InputError: A setting, a shape or a type does not fit, or a cloud is empty or not finite.
     """
     settings = resolve(config)
     if settings.flow.engine not in ("groups", "paper"):
@@ -102,15 +105,18 @@ def _flow_of_groups(
     # Coordinates of a map are large. Relative to the middle they lose no accuracy.
     middle = np.median(clouds[0], axis=0)
     points = [cloud - middle for cloud in clouds]
-    inside = [np.flatnonzero((np.abs(cloud[:, :2]) < _MAX_EXTENT_M).all(1)) for cloud in points]
-    points_inside = [cloud[rows] for cloud, rows in zip(points, inside, strict=True)]
+    rows_inside = [
+        np.flatnonzero((np.abs(cloud[:, :2]) < _MAX_EXTENT_M).all(1)) for cloud in points
+    ]
+    points_inside = [cloud[rows] for cloud, rows in zip(points, rows_inside, strict=True)]
     ground = HeightMap.of(points_inside)
     heights_m = [ground.above(cloud) for cloud in points_inside]
-    above = [
-        rows[height_m >= ABOVE_GROUND_M] for rows, height_m in zip(inside, heights_m, strict=True)
+    rows_above = [
+        rows[height_m >= ABOVE_GROUND_M]
+        for rows, height_m in zip(rows_inside, heights_m, strict=True)
     ]
     field = FlowField.zero(len(clouds[0]))
-    if not (len(above[0]) and len(above[1])):
+    if not (len(rows_above[0]) and len(rows_above[1])):
         return field
     if times is not None:
         shares = times.shares
@@ -119,15 +125,15 @@ def _flow_of_groups(
         if lidars is not None:
             _separate_scanners(points, lidars)
 
-    source, target = (PairCloud(points[i][rows], shares[i][rows]) for i, rows in enumerate(above))
+    source = PairCloud(points[0][rows_above[0]], shares[0][rows_above[0]])
+    target = PairCloud(points[1][rows_above[1]], shares[1][rows_above[1]])
     source_height_m = heights_m[0][heights_m[0] >= ABOVE_GROUND_M]
     apart_s = None if times is None else times.apart_s
-    source_initial = None if initial is None else initial[above[0]]
-    motions, field.instance[above[0]] = find_movers(
-        source, target, source_height_m, ground, apart_s, source_initial
-    )
+    source_flow = None if initial is None else initial[rows_above[0]]
+    motions, instance = find_movers(source, target, source_height_m, ground, apart_s, source_flow)
+    field.instance[rows_above[0]] = instance
     is_low = (heights_m[0] < ABOVE_GROUND_M) & (heights_m[0] > _MIN_LOW_M)
-    _attach_below(points[0], field, inside[0][is_low])
+    _attach_below(points[0], field, rows_inside[0][is_low])
 
     to_reference = np.zeros_like(clouds[0])
     for k, motion in enumerate(motions):

@@ -9,8 +9,8 @@ import numpy as np
 
 from densify.config import Config
 from densify.flow.engines import Scene
-from densify.flow.tracking.candidates import Candidates, closer_rings, cluster_around
-from densify.flow.tracking.groups import GroupMotion, motion_of
+from densify.flow.tracking.candidates import Candidates, cluster_around, compress_heights
+from densify.flow.tracking.groups import GroupMotion, find_group_motion
 from densify.geometry.types import Float
 from densify.learning.network import NUM_SWEEPS, AboveGround, Model, order_for, read_model
 
@@ -41,7 +41,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
         grouped, common_m_s = _grouped(scene, index, candidates, above[index], velocity_m_s)
         all_grouped.append(grouped)
         velocities.append(common_m_s)
-    return motion_of(scene, tuple(all_grouped), velocities)
+    return find_group_motion(scene, tuple(all_grouped), velocities)
 
 
 def flows_of(model: Model, above: list[AboveGround], origins: list[Float]) -> list[Float]:
@@ -78,7 +78,7 @@ def _grouped(
     registered = scene.stretch.sweeps[index]
     row = candidates.row
     gap_m = scene.space.sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
-    squeezed = closer_rings(above.points - registered.T_world_lidar[:3, 3], gap_m)
+    squeezed = compress_heights(above.points - registered.T_world_lidar[:3, 3], gap_m)
     num, cluster = cluster_around(squeezed, moves)
     common_m_s = np.zeros_like(velocity_m_s)
     for number in range(num):

@@ -190,7 +190,7 @@ class Recording:
         block = self.cut.blocks[block_index]
         left_out = {
             frame: cause
-            for frame, cause in self.registration(block_index).bad.items()
+            for frame, cause in self.registration(block_index).left_out.items()
             if frame in block
         }
         if key in left_out:

@@ -17,7 +17,8 @@ from densify.geometry.types import Float, Sweep
 
 MANY_POINTS = 30_000  # points of a sweep that makes a surface
 FEW_POINTS = 15_000  # points of a sweep that is aligned
-# The multiples of the golden ratio, modulo 1, are spread evenly for any order of the rings.
+# The multiples of the golden ratio, modulo 1, are spread evenly in [0, 1). Points below a threshold
+# are therefore an even sample of each ring, in any order of the rings.
 _GOLDEN = 0.6180339887498949
 _VOXEL_M = 0.5  # voxel in which a surface keeps one point
 _LEAF_M = 1.0  # voxel of a map
@@ -105,7 +106,8 @@ def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> A
         fit = small_gicp.align(target.points, points, target.tree, T_target_source, kind, **options)
     else:
         fit = small_gicp.align(target, points, T_target_source, **options)
-    # H is a sum over matches, and generalized ICP divides its distances by the deviation.
+    # H is a sum over matches. Generalized ICP divides squared distances by the variance of both
+    # surfaces along the normal.
     num_matches = max(int(fit.num_inliers), 1)
     scale_m2 = _NORMAL_M**2 if is_surface else 1.0
     information = np.asarray(fit.H) * scale_m2 / num_matches

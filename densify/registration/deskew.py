@@ -59,9 +59,9 @@ def deskew_points(sweep: Sweep, twist: Float) -> Float:
 
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
-    """Return (6,) velocities (rad/s, m/s) before and after sweep i, lidar frame; 0 if alone."""
+    """Return (6,) velocities (rad/s, m/s) before and after sweep i, lidar frame."""
     last = len(trajectory.frames) - 1
-    if last == 0:
+    if last == 0:  # the velocity of a single sweep is unknown
         return np.zeros(6), np.zeros(6)
     T = trajectory.T_world_lidar
 
@@ -107,9 +107,9 @@ class Rings(NamedTuple):
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     """Return how sharply points are concentrated in rings, as seen from an origin; 1 if not at all.
 
-    Elevations are divided into cells, and cells into windows. Sharpness is the chance that two
-    returns of a window share a cell, relative to an even spread. The median over the windows keeps
-    flat ground, which all falls into one window, from dominating.
+    Elevations are divided into cells, and about 100 cells form a window. Sharpness is the
+    probability that two returns of a window share a cell, relative to an even spread. The median
+    over the windows keeps flat ground, which lies in one window, from dominating.
 
     Args:
         points: (N,3) metres, in axes with z along the spin axis.
@@ -119,17 +119,18 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
     cell = ((elevation + 0.5 * np.pi) / (bins * _BIN_RAD)).astype(np.int64)
-    width = max(8, _WINDOW_CELLS // bins)
+    width = max(8, _WINDOW_CELLS // bins)  # cells of a window
     num_cells = int(np.pi / (bins * _BIN_RAD) + 1)
     num_windows = -(-num_cells // width)  # rounded up
     count = np.bincount(cell, minlength=num_windows * width).astype(np.float64)
     count = count.reshape(num_windows, width)
     total = count.sum(axis=1)
-    dense = total > _LEAST_SHARE * len(points)
-    if not dense.any():
+    is_populated = total > _LEAST_SHARE * len(points)
+    if not is_populated.any():
         return 1.0
-    chance = (count[dense] ** 2).sum(axis=1) / total[dense] ** 2
-    return float(np.median(chance) * width)
+    # An even spread has the probability 1 / width.
+    probability = (count[is_populated] ** 2).sum(axis=1) / total[is_populated] ** 2
+    return float(np.median(probability) * width)
 
 
 def rings_by_motion(
@@ -145,26 +146,26 @@ def rings_by_motion(
         origins_m: Positions (3,) of the scanner to try, in its axes; the sharpest counts.
     """
 
-    def find_sharpest(moved: Float) -> float:
+    def best_sharpness(moved: Float) -> float:
         return max(sharpness(moved @ R.T, origin_m) for origin_m in origins_m)
 
     def move(since_s: Float) -> Float:
         return poses.transform_each(since_s[:, None] * twist, points)
 
-    # The time to which the points were compensated is unknown.
+    # It is unknown to which time within the sweep the points were compensated.
     moments_s = {
         "its stamp": 0.0,
         "its first point": float(offset_s.min()),
         "its last point": float(offset_s.max()),
     }
     sharpness_undone = {
-        moment: find_sharpest(move(moment_s - offset_s)) for moment, moment_s in moments_s.items()
+        moment: best_sharpness(move(moment_s - offset_s)) for moment, moment_s in moments_s.items()
     }
     sharpest_moment = max(sharpness_undone, key=lambda moment: sharpness_undone[moment])
     return Rings(
-        as_stored=find_sharpest(points),
+        as_stored=best_sharpness(points),
         undone=sharpness_undone[sharpest_moment],
-        done=find_sharpest(move(offset_s)),
+        done=best_sharpness(move(offset_s)),
         moment=sharpest_moment,
     )
 

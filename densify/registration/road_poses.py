@@ -79,8 +79,8 @@ def follow_road(
     twist = latest.twist_before if is_backwards else latest.twist_after
     speed_m_s = float(np.linalg.norm(twist[3:]))
     travel_m = 0.0
-    # If even the middle between a sweep and the next one is too near to the chain, the next sweep
-    # is nearer to the wanted gap.
+    # The sweep nearest to the wanted gap is registered: a sweep is skipped if even the middle
+    # between it and the next one lies within the gap, because the next one is then nearer.
     middle_ns = stamp_ns + np.diff(stamp_ns, append=stamp_ns[-1:]) / 2
     for frame, time_ns, to_next_ns in zip(frames, stamp_ns.tolist(), middle_ns, strict=True):
         gap_s = min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
@@ -91,6 +91,7 @@ def follow_road(
         if sweep is None:
             return
         step_s = (time_ns - latest_ns) * 1e-9
+        # Constant velocity predicts the pose, and deskews the sweep for the alignment.
         T_guess = T_world_lidar @ poses.exp(twist * step_s)
         guessed_surface = Surface.of(deskew_points(subsample(sweep, FEW_POINTS), twist))
         T_aligned, overlap, _ = align(chain, guessed_surface, T_guess, _CHAIN_MATCH_M)
@@ -148,14 +149,14 @@ def relax_poses(
     submap_of_sweep, middle = _group_into_submaps(is_known, num_sweeps)
     T = T_world_lidar[middle]
     is_fixed = is_known[middle]
-    # Two fixed submaps need no alignment.
+    # Pairs (target, source) of submaps; two fixed submaps need no alignment.
     pairs = [
         (i, i + distance)
         for i in range(len(middle))
         for distance in _PAIR_DISTANCES
         if i + distance < len(middle) and not (is_fixed[i] and is_fixed[i + distance])
     ]
-    used = sorted({i for pair in pairs for i in pair})
+    needed_submaps = sorted({i for pair in pairs for i in pair})
 
     def make_submap(i: int) -> Surface:
         sweeps = np.flatnonzero(submap_of_sweep == i).tolist()
@@ -165,7 +166,7 @@ def relax_poses(
         return Surface.joined([surfaces[sweep] for sweep in sweeps], T_submap_lidar)
 
     with ThreadPoolExecutor(num_threads()) as pool:
-        submaps = dict(zip(used, pool.map(make_submap, used), strict=True))
+        submaps = dict(zip(needed_submaps, pool.map(make_submap, needed_submaps), strict=True))
 
         def align_pair(pair: tuple[int, int]) -> Alignment:
             i, j = pair
@@ -175,8 +176,8 @@ def relax_poses(
     graph = _Graph(np.array(pairs, int).reshape(-1, 2), is_fixed, alignments)
     T_relaxed = graph.relax(T)
     # The sweeps of a submap move with its middle sweep. Known poses stay as they are, to the bit.
-    change = T_relaxed @ poses.inverse(T)
-    T_moved = change[submap_of_sweep] @ T_world_lidar
+    T_correction = T_relaxed @ poses.inverse(T)
+    T_moved = T_correction[submap_of_sweep] @ T_world_lidar
     T_sweeps = np.where(is_known[:, None, None], T_world_lidar, T_moved)
     return Relaxed(T_sweeps, graph.are_connected(T_relaxed)[submap_of_sweep])
 
@@ -222,11 +223,11 @@ class _Graph:
     def relax(self, T_world_submap: Float) -> Float:
         """Return the submap poses (m,4,4) that fit the alignments best, by Gauss-Newton."""
         T = T_world_submap.copy()
-        free = ~self._is_fixed
-        if not free.any():
+        is_free = ~self._is_fixed
+        if not is_free.any():
             return T
         for _ in range(_NUM_STEPS):
-            T[free] = T[free] @ poses.exp(self._step(T))
+            T[is_free] = T[is_free] @ poses.exp(self._step(T))
         return T
 
     def are_connected(self, T: Float) -> Bool:
@@ -263,7 +264,7 @@ class _Graph:
         return np.sqrt(np.maximum(square, 0))
 
     def _step(self, T: Float) -> Float:
-        """Return (free,6) the next Gauss-Newton step of each free submap, in its own frame."""
+        """Return (f,6) the next Gauss-Newton step of each free submap, in its own frame."""
         residual = self._residual(T)
         # Cauchy weights, which limit the influence of wrong alignments
         weight = 1 / (1 + (self._error_m(residual) / _USUAL_M) ** 2)
@@ -273,7 +274,8 @@ class _Graph:
         slope[:, :, :6] = -adjoint.transpose(0, 2, 1)
         slope[:, :, 6:] = np.eye(6)
         weighted = slope.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
-        # Normal equations. Unknowns of fixed submaps come after all others, and are cut off.
+        # Normal equations of 6 unknowns per submap. Fixed submaps share unknowns after all others,
+        # which are cut off.
         num = 6 * int((~self._is_fixed).sum())
         first = np.where(self._is_fixed, num, 6 * (np.cumsum(~self._is_fixed) - 1))
         unknown = (first[self._ends][:, :, None] + np.arange(6)).reshape(-1, 12)

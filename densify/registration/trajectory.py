@@ -61,7 +61,7 @@ class Registration:
     # Trajectories of consecutive sweeps, each in a world of its own, including the lead-in sweeps
     # before the block
     pieces: tuple[Trajectory, ...]
-    bad: Mapping[int, LeftOut]  # frame number -> reason why the sweep is not used
+    left_out: Mapping[int, LeftOut]  # frame number -> reason why the sweep is not used
 
 
 def find_trajectory(
@@ -69,12 +69,16 @@ def find_trajectory(
 ) -> Trajectory:
     """Return the poses of raw sweeps: the recorded poses after a check, or registered ones.
 
-    Each sweep is registered with the surfaces of earlier sweeps. KISS-ICP predicts the motion of
-    dense sweeps.
+    Each sweep is registered with the surfaces of earlier sweeps. If half the sweeps have at least
+    30,000 points, KISS-ICP predicts the motion, else constant velocity.
 
     Args:
         sweeps: Raw sweeps, ascending in time.
         recorded: Recorded poses of these sweeps, None to register them.
+
+    Returns:
+        Poses (S,4,4) of the sweeps at their reference times. The world of registered poses is the
+            lidar frame of the first sweep.
 
     Raises:
         UnfitSweepError: The stamps do not ascend, or a sweep has too few points to be registered.
@@ -92,7 +96,7 @@ def find_trajectory(
         check_overlap(points, recorded, settings)
         return replace(recorded, R_level_lidar=find_upright(sweeps))
     _check_number_of_points(sweeps, settings)
-    # KISS-ICP would match sparse sweeps with the scan pattern.
+    # In sparse sweeps KISS-ICP would align the scan patterns instead of the surfaces.
     is_dense = len(sweeps) > 1 and np.median([len(sweep) for sweep in sweeps]) >= MANY_POINTS
     twists = find_odometry(sweeps, settings) if is_dense else None
     T_world_lidar, points = register_on_surfaces(sweeps, twists)
@@ -148,13 +152,14 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 
 
 def find_jump(twist: Float, previous_twist: Float | None, step_s: float) -> str:
-    """Return, in words, why no vehicle can move as given; "" if it can.
+    """Return, in words, why no vehicle can make a step between two sweeps; "" if one can.
 
     Args:
         twist: (6,) velocity of the step (rad/s, m/s).
         previous_twist: (6,) velocity of the previous step, None if unknown.
         step_s: Duration of the step.
     """
+    # Errors of both poses appear as a speed, the greater the shorter the step.
     slack_m_s = _POSE_NOISE_M / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
     if not (speed_m_s <= MAX_SPEED_M_S + slack_m_s and turn_deg_s <= _MAX_TURN_RATE_DEG_S):
@@ -177,8 +182,8 @@ def check_overlap(
 ) -> None:
     """Raise UnplacedSweepError if a sweep overlaps too little with the preceding third of a second.
 
-    Odometry can continue at constant velocity over sweeps of another place. One earlier sweep is
-    not enough for a scan pattern that does not repeat. Very sparse sweeps pass.
+    Odometry can continue at constant velocity over sweeps of another place. The test needs several
+    earlier sweeps, because a scan pattern may not repeat. Sweeps with under 200 points pass.
 
     Args:
         points: (N,3) of each sweep, deskewed, metres, world.
@@ -188,6 +193,7 @@ def check_overlap(
     points_above = [above_ground(sweep_points) for sweep_points in points]
     trees = [tree_of(sweep_points) for sweep_points in points_above]
     for i in range(1, len(points)):
+        # At least the previous sweep counts, however long ago it was.
         first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - FRESH_NS)), i - 1)
         share = _share_on(points_above[i], trees[first:i])
         if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < FRESH_NS:
@@ -217,8 +223,8 @@ def _share_near_start(
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
     """Return the share of (N,3) points within 0.5 m of any tree's points; 1 for few points."""
     if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
-        return 1.0  # too few points to tell
-    unmatched = points[:: len(points) // _OVERLAP_POINTS + 1]
+        return 1.0  # too few points for a decision
+    unmatched = points[:: len(points) // _OVERLAP_POINTS + 1]  # a sample, of which matches drop out
     num = len(unmatched)
     for tree in trees:
         distance, _ = tree.query(unmatched, distance_upper_bound=_OVERLAP_M)

@@ -36,6 +36,8 @@ class Strips:
 
     def __init__(self, points: Float) -> None:
         """Index the points (N,3, metres), given in scan order."""
+        # (3,S) bounds of the strips, and (S,3,32) their points: both are compared along contiguous
+        # memory.
         begins = np.arange(0, len(points), _STRIP)
         self._low = np.ascontiguousarray(np.minimum.reduceat(points, begins).T)
         self._high = np.ascontiguousarray(np.maximum.reduceat(points, begins).T)
@@ -46,6 +48,7 @@ class Strips:
 
     def rows_inside(self, low: Float, high: Float) -> Int:
         """Return the ascending indices of the points in a box with corners low and high (3,)."""
+        # Only strips whose bounds overlap the box can have points in it.
         low, high = low[:, None], high[:, None]
         strip_numbers = np.flatnonzero(((self._low < high) & (self._high > low)).all(axis=0))
         points = self._strips[strip_numbers]
@@ -127,7 +130,7 @@ class Batch:
         )
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Concatenate the arrays of this batch's sweeps, in the order of ``obstacles``.
+        """Concatenate the arrays of this batch's sweeps to one, in the order of ``obstacles``.
 
         Args:
             columns: For every sweep of the stretch, an array with a value for each obstacle.
@@ -145,7 +148,7 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
     """Concatenate the obstacles of sweeps; clusters within `LINK_M` of each other become one."""
     if len(sweeps) == 1:
         return sweeps[0]
-    # Labels of the sweeps' clusters are made unique.
+    # Every sweep counts its clusters from 0. An offset makes the labels unique.
     first_labels = np.cumsum([0] + [sweep.num_clusters for sweep in sweeps]).tolist()
     num_labels = first_labels[-1]
     label = np.concatenate(
@@ -154,8 +157,9 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
             for sweep, first_label in zip(sweeps, first_labels[:-1], strict=True)
         ]
     )
-    # A graph joins each candidate's cluster in its sweep with its group among all sweeps. The
-    # components of this graph are the merged clusters.
+    # Two clusters are merged if they share a group: points of all sweeps that are linked. The nodes
+    # of the graph are clusters, then groups. Each candidate is an edge between its cluster and its
+    # group, and the connected components are the merged clusters.
     points = np.concatenate([sweep.points for sweep in sweeps])
     candidate = np.flatnonzero(label >= 0)
     num_groups, group = link(points[candidate], LINK_M)
@@ -177,36 +181,38 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
 def find_candidates(
     stretch: Stretch, space: FreeSpace, ground: HeightMap, among: Sequence[int] | None = None
 ) -> tuple[Candidates, ...]:
-    """Return the points above the ground of each sweep, and which of them may move.
+    """Return, for each sweep in order, its points above the ground, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
     because usually only a part of a moving object's points is seen through.
 
     Args:
-        among: Indices of the sweeps to work on, None for all.
+        among: Indices of the sweeps to return, None for all.
     """
 
     def find_in_sweep(i: int) -> Candidates:
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
-        above = np.flatnonzero(ground.above(points) >= ABOVE_GROUND_M)
-        points_above = points[above]
-        seed = np.zeros(len(above), bool)
+        rows = np.flatnonzero(ground.above(points) >= ABOVE_GROUND_M)
+        points_above = points[rows]
+        seed = np.zeros(len(rows), bool)
         for j in space.others(i):
-            unmarked = np.flatnonzero(~seed)
+            unmarked = np.flatnonzero(~seed)  # one sweep that saw through a point is enough
             seed[unmarked] = space.seen_through(points_above[unmarked], j)
-        gap_m = space.sensors.gap_m(registered.sweep.points[above], registered.sweep.lidar[above])
-        compressed = closer_rings(points_above - registered.T_world_lidar[:3, 3], gap_m)
+        gap_m = space.sensors.gap_m(registered.sweep.points[rows], registered.sweep.lidar[rows])
+        compressed = compress_heights(points_above - registered.T_world_lidar[:3, 3], gap_m)
         num_clusters, cluster = cluster_around(compressed, seed)
-        return Candidates(above, seed, cluster, num_clusters)
+        return Candidates(rows, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor(num_threads()) as pool:
         sweeps = range(len(stretch.sweeps)) if among is None else among
         return tuple(pool.map(find_in_sweep, sweeps))
 
 
-def closer_rings(points: Float, gap_m: Float) -> Float:
-    """Return the (N,3) points with heights compressed where rings are too far apart to be linked.
+def compress_heights(points: Float, gap_m: Float) -> Float:
+    """Return the (N,3) points, with heights compressed until rings are at most 0.35 m apart.
+
+    Otherwise the rings of an object would be too far apart to be linked.
 
     Args:
         points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
@@ -228,7 +234,7 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
     """Link seeds and points within 0.4 m of seeds into clusters.
 
-    Seeds with few other seeds around them, as in a hedge, do not count.
+    Seeds with a share of other seeds below 0.4 around them, as in a hedge, do not count.
 
     Args:
         points: (N,3) metres.

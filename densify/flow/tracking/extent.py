@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.flow.tracking.candidates import LINK_M, Obstacles, Strips, firing_times_s
-from densify.flow.tracking.following import MISSED_S
+from densify.flow.tracking.following import MAX_MISSED_S
 from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track, near_m
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.seen_through import FreeSpace
@@ -23,11 +23,12 @@ from densify.geometry.types import Bool, Float, Float32, Int, Stretch
 
 Instance = NDArray[np.int32]
 
-_REACH = 1.5  # reach of an object to candidates, in neighbour distances (`near_m`)
-_LEAST_HEIGHT_M, _LEAST_HEIGHT_OF_WALKERS_M = 0.08, 0.1  # above the ground
-_WALKS_M_S = 2.0  # greatest speed of walkers
-_LEAST_SEEDS, _WALKER_M = 0.1, 1.5  # least share of seeds nearby; greatest length of a walker
-_WIDER_M, _MOSTLY = 0.5, 0.5  # least share of moving points within this distance
+_REACH = 1.5  # greatest distance of a candidate from its object, in neighbour distances (`near_m`)
+_MIN_HEIGHT_M, _MIN_WALKER_HEIGHT_M = 0.08, 0.1  # above the ground
+_MAX_WALKER_SPEED_M_S = 2.0  # greatest speed of walkers
+# Shapes of walkers: least share of seeds near a point, greatest length
+_MIN_SEED_SHARE, _MAX_WALKER_M = 0.1, 1.5
+_AROUND_M, _MIN_MOVING_SHARE = 0.5, 0.5  # least share of moving points within this distance
 NUM_COLUMNS = 2.0
 """Columns of rays that may be missing along a side that recedes from the scanner."""
 _LONGEST_HOLE_M = 2.0  # longest hole in a side
@@ -53,8 +54,9 @@ class SweepPoints:
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
-        row = np.flatnonzero(height_m > _LEAST_HEIGHT_M)
+        row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
         gap_m = sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
+        # Candidates may lie farther from the shape: other sweeps saw through them.
         candidate = np.zeros(len(points), bool)
         candidate[obstacles.row[obstacles.candidate]] = True
         reach_m = np.where(candidate[row], _REACH, 1.0) * near_m(gap_m)
@@ -62,7 +64,7 @@ class SweepPoints:
         return SweepPoints(row, points[row], time_s, height_m[row], gap_m, reach_m)
 
     @staticmethod
-    def together(batch: Sequence[SweepPoints]) -> SweepPoints:
+    def concatenate(batch: Sequence[SweepPoints]) -> SweepPoints:
         """Concatenate the points of the sweeps of one batch, in the order of the sweeps."""
         columns = (
             np.concatenate([getattr(sweep, column.name) for sweep in batch])
@@ -77,14 +79,14 @@ class SweepPoints:
 
 
 def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
-    """Return the accumulated shape of a track; shapes of walkers exclude their surroundings.
+    """Return the accumulated shape of a track, for slow objects without their surroundings.
 
     Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped:
 
     - Echoes merged with a wall's. They occur only in even or only in odd sweeps.
     - Points of a bush. They are static, or lie among static points.
-    - Points of a wall. They are hardly ever seen through. Sides of slow cars are alike, hence these
-      points are dropped only if the rest is shorter than 1.5 m.
+    - Points of a wall. They are hardly ever seen through. Sides of slow cars are alike, hence
+      these points are dropped only if the rest is shorter than 1.5 m.
 
     Args:
         obstacles: Points above the ground of each sweep of the stretch.
@@ -92,22 +94,24 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     sweeps = sorted(track.claimed)
     clouds = {j: track.in_object(obstacles[j], track.claimed[j]) for j in sweeps}
     points = np.concatenate(list(clouds.values()))
-    if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _WALKS_M_S:
+    if _speed_m_s(track, sweeps[len(sweeps) // 2], space.clock) > _MAX_WALKER_SPEED_M_S:
         return Shape.of(points)
-    within_m = near_m(space.gap_m(track.centre, sweeps[0]))
+    neighbour_m = near_m(space.gap_m(track.centre, sweeps[0]))
+    # (N,) rank of the sweep that measured each point
     sweep_number = np.repeat(np.arange(len(sweeps)), [len(cloud) for cloud in clouds.values()])
-    recurs = _recurs(points, sweep_number, _REACH * within_m)
-    is_moving = ~_is_static(track, obstacles, clouds, sweep_number, within_m)
-    is_own = recurs & is_moving & close_to_seeds(points, is_moving, _WIDER_M, _MOSTLY)
+    recurs = _recurs(points, sweep_number, _REACH * neighbour_m)
+    is_moving = ~_is_static(track, obstacles, clouds, sweep_number, neighbour_m)
+    is_own = recurs & is_moving & close_to_seeds(points, is_moving, _AROUND_M, _MIN_MOVING_SHARE)
     seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
-    is_core = is_own & close_to_seeds(points, seed, _REACH * within_m, _LEAST_SEEDS)
-    if is_core.any() and np.linalg.norm(np.ptp(points[is_core, :2], axis=0)) < _WALKER_M:
+    # The third kind: points without seeds, which other sweeps hardly ever saw through
+    is_core = is_own & close_to_seeds(points, seed, _REACH * neighbour_m, _MIN_SEED_SHARE)
+    if is_core.any() and np.linalg.norm(np.ptp(points[is_core, :2], axis=0)) < _MAX_WALKER_M:
         return Shape.of(points[is_core])
-    return Shape.of(points[is_own] if is_own.any() else points)
+    return Shape.of(points[is_own] if is_own.any() else points)  # a shape needs points
 
 
 def _recurs(points: Float, sweep_number: Int, reach_m: float) -> Bool:
-    """Return (N,) True for points near points of a sweep of the other parity."""
+    """Return (N,) True for points near a point of a sweep of the other parity (even, odd)."""
     recurs = np.zeros(len(points), bool)
     for parity in (0, 1):
         is_same = sweep_number % 2 == parity
@@ -131,7 +135,7 @@ def _is_static(
     low, high = measured.min(0) - reach_m, measured.max(0) + reach_m
     num_static, num_moved = np.zeros((2, len(measured)), np.int64)
     for number, (j, cloud) in enumerate(clouds.items()):
-        is_other = sweep_number != number
+        is_other = sweep_number != number  # a sweep does not confirm its own points
         # Static points recur in the world, moving points in the object's frame.
         returns = obstacles[j].points[obstacles[j].strips.rows_inside(low, high)]
         if len(returns):
@@ -162,7 +166,7 @@ def assign_points(
     ]
     # Vehicles are extended by the points of the whole batch at once.
     batch_instance = np.concatenate(attached)
-    lengthen(batch_instance, SweepPoints.together(clouds), batch[0], objects, space)
+    extend_vehicles(batch_instance, SweepPoints.concatenate(clouds), batch[0], objects, space)
     ends = np.cumsum([len(sweep_instance) for sweep_instance in attached])
     extended = np.split(batch_instance, ends[:-1])
     instances = []
@@ -173,78 +177,85 @@ def assign_points(
     return instances
 
 
-def attach(seen: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
-    """Return (N,) the index in ``objects`` of the object near each point of sweep i, or -1."""
-    instance = np.full(len(seen.points), -1, np.int32)
-    least_m = np.full(len(seen.points), np.inf)
+def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
+    """Return (N,) the index in ``objects`` of the nearest object at each point of sweep i, or -1.
+
+    A point belongs to an object if it lies near the shape, or inside the outline seen from above.
+    """
+    instance = np.full(len(cloud.points), -1, np.int32)
+    least_m = np.full(len(cloud.points), np.inf)
     for k, (track, shape) in enumerate(objects):
-        if not is_known_at(track, i, clock):
+        if not is_tracked_at(track, i, clock):
             continue
         rim = track.place(shape.rim, track.seen_at(clock.time_ns[i]))
         low, high = rim.min(0) - LINK_M, rim.max(0) + LINK_M
         low[2] = -np.inf  # wheels may lie below all accumulated points
-        rows = seen.strips.rows_inside(low, high)
+        rows = cloud.strips.rows_inside(low, high)
         if not len(rows):
             continue
-        in_object = track.undo(seen.points[rows], seen.time_s[rows])
+        in_object = track.undo(cloud.points[rows], cloud.time_s[rows])
         distance_m, _ = nearest(shape.tree, in_object)
-        belongs = (distance_m < seen.reach_m[rows]) & (seen.height_m[rows] >= ABOVE_GROUND_M)
+        # A point near the shape but below `ABOVE_GROUND_M` may be of the road. Inside the outline
+        # it is of the object, such as a wheel.
+        belongs = (distance_m < cloud.reach_m[rows]) & (cloud.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shape.within_outline(in_object)
-        if _speed_m_s(track, i, clock) <= _WALKS_M_S:
-            belongs &= seen.height_m[rows] >= _LEAST_HEIGHT_OF_WALKERS_M
-        closer = belongs & (distance_m < least_m[rows])
-        instance[rows[closer]] = k
-        least_m[rows[closer]] = distance_m[closer]
+        if _speed_m_s(track, i, clock) <= _MAX_WALKER_SPEED_M_S:
+            belongs &= cloud.height_m[rows] >= _MIN_WALKER_HEIGHT_M
+        # Of several objects the nearest one owns the point.
+        is_nearest = belongs & (distance_m < least_m[rows])
+        instance[rows[is_nearest]] = k
+        least_m[rows[is_nearest]] = distance_m[is_nearest]
     return instance
 
 
-def lengthen(
+def extend_vehicles(
     instance: Instance,
-    seen: SweepPoints,
+    cloud: SweepPoints,
     i: int,
     objects: Sequence[MovingObject],
     space: FreeSpace,
 ) -> None:
-    """Extend vehicles along their heading, as wide and as high as they are, in ``instance`` (N,).
+    """Assign free points ahead of and behind vehicles, in their lane, to the vehicles, in place.
 
     The middle of a long side that moves along itself is never seen through, and lacks candidates.
     The extension ends at a hole, or where another sweep sees through the moved points.
 
     Args:
         instance: (N,) index of each point's object, -1 for none; changed in place.
-        seen: The N points of a batch.
+        cloud: The N points of a batch.
         i: First sweep of the batch.
         objects: Confirmed objects.
     """
-    batch_s = np.ptp(seen.time_s) if len(seen.time_s) else 0.0
+    batch_s = np.ptp(cloud.time_s) if len(cloud.time_s) else 0.0
     for k, (track, shape) in enumerate(objects):
         members = np.flatnonzero(instance == k)
         speed_m_s = _speed_m_s(track, i, space.clock)
-        if not len(members) or speed_m_s <= _WALKS_M_S:
+        if not len(members) or speed_m_s <= _MAX_WALKER_SPEED_M_S:
             continue
         at_s = track.seen_at(space.clock.time_ns[i])
         lane = MovingObject(track, shape).lane(at_s)
         middle = track.place(shape.points.mean(0, keepdims=True), at_s)[0]
-        # Free points near the object, then those in its lane at their own times, then those in its
-        # lane once all are moved to one time
+        # Phase 1: free points in the lane. The first tests are fast and coarse: a box, and the lane
+        # widened by the motion within the batch. The last test moves all points to one time.
         reach_m = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
-        rows = seen.strips.rows_inside(middle - reach_m, middle + reach_m)
+        rows = cloud.strips.rows_inside(middle - reach_m, middle + reach_m)
         rows = rows[instance[rows] < 0]
-        rows = rows[lane.holds(seen.points[rows], speed_m_s * batch_s)]
-        at_once = track.carry(seen.points[rows], seen.time_s[rows], at_s)
-        fits = lane.holds(at_once)
+        rows = rows[lane.holds(cloud.points[rows], speed_m_s * batch_s)]
+        at_one_time = track.carry(cloud.points[rows], cloud.time_s[rows], at_s)
+        fits = lane.holds(at_one_time)
         rows = rows[fits]
-        # Coordinates along the heading
-        along_m = at_once[fits, :2] @ lane.ahead
-        members_at_once = track.carry(seen.points[members], seen.time_s[members], at_s)
-        members_m = members_at_once[:, :2] @ lane.ahead
+        # Phase 2: points that are linked with the object, by coordinates along the heading
+        along_m = at_one_time[fits, :2] @ lane.ahead
+        members_at_one_time = track.carry(cloud.points[members], cloud.time_s[members], at_s)
+        members_m = members_at_one_time[:, :2] @ lane.ahead
         columns_m = columns_apart_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
         hole_m = float(np.clip(NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
         is_linked = _is_linked(along_m, members_m, hole_m)
+        # Phase 3: points up to the first violations
         if is_linked.any():
             rows = rows[is_linked]
             ahead_m = along_m[is_linked] - np.median(members_m)
-            instance[rows[_is_free_of_violations(track, seen, rows, ahead_m, i, space)]] = k
+            instance[rows[_is_unviolated(track, cloud, rows, ahead_m, i, space)]] = k
 
 
 def columns_apart_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
@@ -255,6 +266,8 @@ def columns_apart_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: S
         ahead: (2,) unit vector along the side, world.
         T_lidar_world: (4,4) inverse of the lidar's pose.
     """
+    # Two rays that differ by a small angle hit the side (angle x range² / distance of the side's
+    # line from the lidar) apart.
     in_lidar = poses.transform(T_lidar_world, point[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
     aside_m = max(abs(float(in_lidar @ [-y, x])), 1e-3)
@@ -272,8 +285,8 @@ def _is_linked(along_m: Float, members_m: Float, hole_m: float) -> Bool:
     return np.isin(run[: len(along_m)], run[len(along_m) :])
 
 
-def _is_free_of_violations(
-    track: Track, seen: SweepPoints, rows: Int, ahead_m: Float, i: int, space: FreeSpace
+def _is_unviolated(
+    track: Track, cloud: SweepPoints, rows: Int, ahead_m: Float, i: int, space: FreeSpace
 ) -> Bool:
     """Return (N,) True for extension points up to the first violations, ahead and behind."""
     # ahead_m: (N,) metres ahead of the object's middle, negative behind
@@ -281,23 +294,24 @@ def _is_free_of_violations(
     num_steps = int(step.max(initial=0)) + 1
     step += num_steps * (ahead_m < 0)  # first the steps ahead, then the steps behind
 
-    def count_up_to(steps: Int) -> Int:
+    def count_up_to(steps: Int) -> Int:  # (2,num_steps) points up to each step, ahead and behind
         num_at = np.bincount(steps, minlength=2 * num_steps)
         return num_at.reshape(2, num_steps).cumsum(axis=1)
 
     is_blocked = np.zeros((2, num_steps), bool)
-    in_object = track.undo(seen.points[rows], seen.time_s[rows])
+    in_object = track.undo(cloud.points[rows], cloud.time_s[rows])
     for j in space.others(i):
         num_violations = count_up_to(step[track.seen_through(in_object, j, space)])
         is_blocked |= num_violations > _MAX_VIOLATIONS * count_up_to(step)
-    is_beyond_block = np.logical_or.accumulate(is_blocked, axis=1)
-    return np.asarray(~is_beyond_block.ravel()[step])
+    # A violation also rejects all points behind it, as seen from the object.
+    is_rejected = np.logical_or.accumulate(is_blocked, axis=1)
+    return np.asarray(~is_rejected.ravel()[step])
 
 
-def is_known_at(track: Track, i: int, clock: Clock) -> bool:
-    """Return True if sweep i is at most 0.2 s before the track's first or after its last sweep."""
+def is_tracked_at(track: Track, i: int, clock: Clock) -> bool:
+    """Return True if sweep i is from 0.2 s before a track's first to 0.2 s after its last sweep."""
     first, last = min(track.claimed), max(track.claimed)
-    return first <= i <= last or any(clock.near(i, end, MISSED_S) for end in (first, last))
+    return first <= i <= last or any(clock.near(i, end, MAX_MISSED_S) for end in (first, last))
 
 
 def _speed_m_s(track: Track, i: int, clock: Clock) -> float:

@@ -31,7 +31,7 @@ _NEAR_S, _AROUND_S = 0.1, 0.5  # times to the nearest and the farthest batches t
 STEP_M = 0.2  # side of a voxel
 _MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
 FEW_POINTS, _MANY_POINTS = 60, 600  # points of a cluster in the first vote, and in later votes
-_FINE_M_S = 0.2  # velocity step of the last vote
+_FINE_M_S = 0.2  # velocity step of the last vote: half a voxel in 0.5 s
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class DistanceField:
         low = inside.min(0) - 2 * LINK_M
         shape = tuple(np.ceil((inside.max(0) + 2 * LINK_M - low) / STEP_M).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
-        # Voxels around a candidate, and their nearness
+        # Offsets of the voxels around a candidate, and the nearness in them
         reach = int(np.ceil(LINK_M / STEP_M))
         span = np.arange(-reach, reach + 1)
         offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
@@ -63,8 +63,12 @@ class DistanceField:
         _spread(inside, low, STEP_M, offsets[is_reached], values, nearness)
         return DistanceField(nearness, low, tree_of(points), time_s)
 
-    def raise_to(self, nearness: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``nearness`` (V,N), 0 to 255, of N points moved at velocities (V,3), m/s, world."""
+    def raise_nearness(self, nearness: Bytes, group: Group, velocities: Float) -> None:
+        """Raise ``nearness`` (V,N), in place, to that of N points moved at V velocities.
+
+        Nearness is from 0 to 255. The points are moved to the time of this sweep, at velocities
+        (V,3), m/s, world.
+        """
         if self.tree is None:
             return
         # The firing time depends on the position, and the position on the time. Each is taken from
@@ -76,7 +80,7 @@ class DistanceField:
         _look_up.over_rows(
             len(velocities),
             group.points,
-            group.late_s,
+            group.offset_s,
             velocities,
             elapsed_s,
             self.low,
@@ -91,7 +95,7 @@ class Group:
     """The N points of a cluster in one batch (consecutive sweeps within 0.1 s)."""
 
     points: Float  # (N,3) world
-    late_s: Float  # (N,) firing times relative to ``middle_s``
+    offset_s: Float  # (N,) firing times since ``middle_s``
     middle_s: float  # mean firing time of the points
     middle: Float  # (3,) mean of the points
 
@@ -105,8 +109,8 @@ class Group:
         """Return the group with at most ``max_points`` points, evenly chosen."""
         step = len(self.points) // max_points + 1
         points = np.ascontiguousarray(self.points[::step])
-        late_s = np.ascontiguousarray(self.late_s[::step])
-        return Group(points, late_s, self.middle_s, self.middle)
+        offset_s = np.ascontiguousarray(self.offset_s[::step])
+        return Group(points, offset_s, self.middle_s, self.middle)
 
 
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
@@ -122,21 +126,24 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
         fields: For each batch, the distance fields of its sweeps.
         clock: Times of the batches.
     """
-    near_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
-    far_s = max(_AROUND_S / 2, near_s)
-    near_fields = [fields[m] for m in _batches_around(n, near_s, clock)]
-    all_fields = near_fields + [fields[m] for m in _batches_around(n, far_s, clock)]
-    # Coarse steps of two voxels, over all velocities
+    near_step_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
+    # The farthest batches are two of these steps away.
+    far_step_s = max(_AROUND_S / 2, near_step_s)
+    near_fields = [fields[m] for m in _batches_around(n, near_step_s, clock)]
+    all_fields = near_fields + [fields[m] for m in _batches_around(n, far_step_s, clock)]
+    # First vote: all velocities, in steps that move the group by two voxels
     few_points = group.thinned(FEW_POINTS)
-    coarse_m_s = 2 * STEP_M / near_s
-    coarse_grid = _grid(int(MAX_SPEED_M_S / coarse_m_s)) * coarse_m_s
-    rough_m_s = _best_velocity(few_points, near_fields, coarse_grid)
-    # A third of the coarse step, up to two coarse steps to each side
+    coarse_step_m_s = 2 * STEP_M / near_step_s
+    coarse_grid = _grid(int(MAX_SPEED_M_S / coarse_step_m_s)) * coarse_step_m_s
+    coarse_m_s = _best_velocity(few_points, near_fields, coarse_grid)
+    # Second vote: thirds of the coarse step, up to two coarse steps (6 thirds) to each side
     many_points = group.thinned(_MANY_POINTS)
-    finer_m_s = _best_velocity(many_points, near_fields, rough_m_s + _grid(6) * coarse_m_s / 3)
-    # Steps of about 0.2 m/s, up to the last step to each side
-    num = max(1, round(coarse_m_s / 3 / _FINE_M_S))
-    return _best_velocity(many_points, all_fields, finer_m_s + _grid(num) * coarse_m_s / 3 / num)
+    medium_grid = coarse_m_s + _grid(6) * coarse_step_m_s / 3
+    medium_m_s = _best_velocity(many_points, near_fields, medium_grid)
+    # Last vote: steps of about 0.2 m/s, up to one step of the second vote to each side
+    num_steps = max(1, round(coarse_step_m_s / 3 / _FINE_M_S))
+    fine_grid = medium_m_s + _grid(num_steps) * coarse_step_m_s / 3 / num_steps
+    return _best_velocity(many_points, all_fields, fine_grid)
 
 
 def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
@@ -151,17 +158,18 @@ def _best_velocity(
     """Return the velocity (3,) among (V,3) that brings the group nearest to candidates."""
     cost = np.zeros(len(velocities))
     for batch_fields in fields:
+        # A point counts once per batch, by the sweep in which it comes nearest to a candidate.
         nearness = np.zeros((len(velocities), len(group.points)), np.uint8)
         for field in batch_fields:
-            field.raise_to(nearness, group, velocities)
+            field.raise_nearness(nearness, group, velocities)
         cost += 1 - nearness.mean(axis=1) / 255
-    # Of equal velocities the slowest is best.
+    # Of velocities with the same nearness the slowest is best.
     return np.asarray(velocities[np.argmin(cost + 1e-3 * np.linalg.norm(velocities, axis=1))])
 
 
-def _grid(num: int) -> Float:
-    """Return all (V,3) horizontal steps with whole x and y from -num to num."""
-    span = np.arange(-num, num + 1.0)
+def _grid(num_steps: int) -> Float:
+    """Return all (V,3) horizontal steps with integer x and y, up to ``num_steps`` to each side."""
+    span = np.arange(-num_steps, num_steps + 1.0)
     x, y = np.meshgrid(span, span, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
 
@@ -172,11 +180,9 @@ def _spread(
 ) -> None:
     """Raise the cells of ``grid`` at ``offsets`` (K,3) from points (N,3) to ``values`` (K,)."""
     for i in range(len(points)):
-        x, y, z = (
-            int((points[i, 0] - low[0]) / step),
-            int((points[i, 1] - low[1]) / step),
-            int((points[i, 2] - low[2]) / step),
-        )
+        x = int((points[i, 0] - low[0]) / step)
+        y = int((points[i, 1] - low[1]) / step)
+        z = int((points[i, 2] - low[2]) / step)
         for k in range(len(offsets)):
             voxel = x + offsets[k, 0], y + offsets[k, 1], z + offsets[k, 2]
             grid[voxel] = max(grid[voxel], values[k])
@@ -187,7 +193,7 @@ def _look_up(
     first: int,
     last: int,
     points: Float,
-    late_s: Float,
+    offset_s: Float,
     velocities: Float,
     elapsed_s: Float,
     low: Float,
@@ -196,10 +202,11 @@ def _look_up(
     nearness: Bytes,
 ) -> None:
     """Raise ``nearness`` (V,N), in place, to the grid's at N points moved at V velocities."""
+    # Positions up to one cell below the grid are truncated to cell 0. Its margin has nearness 0.
     num_x, num_y, num_z = grid.shape
     for v in range(first, last):
         for i in range(len(points)):
-            moving_s = elapsed_s[v] - late_s[i]
+            moving_s = elapsed_s[v] - offset_s[i]
             x = int((points[i, 0] + velocities[v, 0] * moving_s - low[0]) * cells_per_m)
             y = int((points[i, 1] + velocities[v, 1] * moving_s - low[1]) * cells_per_m)
             z = int((points[i, 2] + velocities[v, 2] * moving_s - low[2]) * cells_per_m)
@@ -208,39 +215,47 @@ def _look_up(
 
 
 MIN_POINTS = 8  # to start a track
-_NEARER_END = 0.7  # factor of a start's worth for each 0.1 s that an end is nearer than 0.5 s
+# Factor of the rank of a start for each 0.1 s by which it is less than 0.5 s away from the first or
+# last sweep: fewer sweeps vote for its velocity.
+_END_FACTOR = 0.7
 FIT_M = 0.3
 """Greatest distance of a point from the object that claims it."""
-_SHARE_UNSEEN = 0.5  # least share of the object's usual number of points
+# Without candidates: least number of points, as a share of the object's usual number
+_MIN_SHARE_WITHOUT_CANDIDATES = 0.5
 # Standard deviation (m, m, rad) of a prediction over 0.25 s; it grows with longer times.
 PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _RECENT_S = 0.4  # age of the states that the rate is fitted to
-_GIVEN_S2 = 0.02  # the given velocity weighs as much as states with this sum of squared times
-_TURNS_ON = 0.9  # share of the turn rate that is predicted: turns level out
-_MISSES_ALLOWED, MISSED_S = 1, 0.2  # a track ends when both are exceeded
+# Weight of the velocity that a track starts at: that of states with this sum of squared times, such
+# as two states 0.2 s apart
+_START_RATE_S2 = 0.02
+_TURN_RATE_SHARE = 0.9  # share of the measured turn rate that is predicted, because turns end
+# A track ends if the object is not found in more batches, and for a longer time.
+_MAX_MISSED_BATCHES, MAX_MISSED_S = 1, 0.2
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
-    """Return the clusters that may start a track, the best first: batch index, obstacle rows."""
+    """Return the clusters that may start a track: batch index, (K,) rows of the batch's obstacles.
+
+    Large clusters come first. Those near the ends of the stretch come later.
+    """
     starts = []
 
-    def worth(start: tuple[int, Int]) -> float:
+    def rank(start: tuple[int, Int]) -> float:
         n, members = start
         nearer_s = max(0.0, _AROUND_S - clock.from_end_s(n))
-        return float(len(members) * _NEARER_END ** (nearer_s / _NEAR_S))
+        return float(len(members) * _END_FACTOR ** (nearer_s / _NEAR_S))
 
     for n, obstacles in enumerate(batches):
         cluster, candidate = obstacles.cluster, obstacles.candidate
         size = np.bincount(cluster[candidate], minlength=obstacles.num_clusters)
-        num_seeds = np.bincount(
-            cluster[candidate & obstacles.seed], minlength=obstacles.num_clusters
-        )
+        seed_cluster = cluster[candidate & obstacles.seed]
+        num_seeds = np.bincount(seed_cluster, minlength=obstacles.num_clusters)
         may_start = (size >= MIN_POINTS) & (num_seeds >= MIN_SEED_SHARE * size)
         starts += [(n, np.flatnonzero(cluster == k)) for k in np.flatnonzero(may_start)]
-    return sorted(starts, key=worth, reverse=True)
+    return sorted(starts, key=rank, reverse=True)
 
 
-def velocities_beside(
+def find_nearby_velocities(
     batch: Batch, members: Int, objects: Sequence[MovingObject]
 ) -> Iterator[Float]:
     """Yield the velocity (3,), m/s, of each object within 1 m of a cluster.
@@ -279,12 +294,15 @@ class Follower:
     """Tracker of clusters through the batches."""
 
     batches: Sequence[Batch]  # groups of consecutive sweeps within 0.1 s
-    free: Sequence[Bool]  # for each sweep (C,) True for obstacles that no track has claimed
+    is_free: Sequence[Bool]  # for each sweep (C,) True for obstacles that no track has claimed
     ground: HeightMap
     clock: Clock  # times of the batches
 
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
-        """Track a cluster forwards, then backwards; the model is made of all points found so far.
+        """Return the track of a cluster, followed forwards in time, then backwards.
+
+        All points found so far, in the object's frame, are the model that later points are aligned
+        with.
 
         Args:
             members: Rows of the cluster in the obstacles of batch ``start``.
@@ -299,48 +317,50 @@ class Follower:
         track.add(start, batch, np.zeros(4), seen_s, members)
         model = Model(points)
         for direction in (1, -1):
-            last = start  # latest batch in which the object was found
+            last_found = start  # batch index
             n = start + direction
-            while 0 <= n < len(self.batches) and self._may_continue(last, n):
+            while 0 <= n < len(self.batches) and self._is_within_reach(last_found, n):
                 sighting = self._find(model, track, rate, n)
                 if sighting is not None:
-                    last = n
+                    last_found = n
                     track.add(n, self.batches[n], sighting.state, sighting.seen_s, sighting.rows)
                     model.add(undo(sighting.state, sighting.points, track.centre))
                 n += direction
         return track
 
-    def _may_continue(self, last: int, n: int) -> bool:
-        """Return True if a track last observed in batch ``last`` may still reach batch n."""
-        return abs(n - last) <= 1 + _MISSES_ALLOWED or self.clock.near(n, last, MISSED_S)
+    def _is_within_reach(self, last_found: int, n: int) -> bool:
+        """Return True if an object last found in a batch may be found again in batch n."""
+        num_missed = abs(n - last_found) - 1
+        return num_missed <= _MAX_MISSED_BATCHES or self.clock.near(n, last_found, MAX_MISSED_S)
 
     def _find(self, model: Model, track: Track, rate: Float, n: int) -> _Sighting | None:
-        """Align the obstacles of batch n with the object so far; None if too few points fit."""
+        """Return where the object is in batch n, None if too few points fit its model."""
         centre = track.centre
         batch = self.batches[n]
         obstacles = batch.obstacles
         num_recent = self.clock.num_in(_RECENT_S)
 
-        # Free obstacles at the expected position, at any time of the batch
+        # Phase 1: free obstacles in the box around the expected position. The firing time of the
+        # points is not known yet, hence the box grows by the motion within the batch.
         expected_s = track.seen_at(batch.time_ns)
         expected = _predict(track, rate, num_recent, expected_s)
         expected_points = apply(expected.state, model.points, centre)
         slack_m = GATES_M[0] + batch.half_s * np.abs(expected.rate[:3])
         low, high = expected_points.min(0) - slack_m, expected_points.max(0) + slack_m
-        inside = obstacles.strips.rows_inside(low, high)
-        inside = inside[batch.gather(self.free)[inside]]
-        rows = inside[obstacles.cluster[inside] >= 0]
+        free_rows = obstacles.strips.rows_inside(low, high)
+        free_rows = free_rows[batch.gather(self.is_free)[free_rows]]
+        rows = free_rows[obstacles.cluster[free_rows] >= 0]  # candidates
         min_num_rows = float(MIN_FIT)
         if len(rows) < MIN_FIT:
             # No sweep saw through the object here, hence it has no candidates. Other obstacles are
             # the object if they are nearly as many as usual.
             usual_num = float(np.median([track.num_points(m) for m in track.observations]))
-            rows = inside
-            min_num_rows = max(MIN_FIT, _SHARE_UNSEEN * usual_num)
+            rows = free_rows
+            min_num_rows = max(MIN_FIT, _MIN_SHARE_WITHOUT_CANDIDATES * usual_num)
         if len(rows) < min_num_rows:
             return None
 
-        # Alignment, at the mean firing time
+        # Phase 2: alignment with the model, from the state predicted for the mean firing time
         seen_s = float(obstacles.time_s[rows].mean())
         predicted = _predict(track, rate, num_recent, seen_s)
         predicted.state[2] = track.rise_m(self.ground, predicted.state)
@@ -349,6 +369,7 @@ class Follower:
         if state is None:
             return None
         state[2] = track.rise_m(self.ground, state)
+        # Phase 3: only points that lie on the aligned model belong to the object.
         fits = model.covers(undo(state, points, centre), FIT_M)
         if fits.sum() < min_num_rows:
             return None
@@ -357,8 +378,8 @@ class Follower:
 
 def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
     """Return (N,3) obstacles ``rows`` moved to time ``time_s`` by the velocity ``rate[:3]``."""
-    late_s = time_s - obstacles.time_s[rows]
-    return obstacles.points[rows] + late_s[:, None] * rate[:3]
+    offset_s = time_s - obstacles.time_s[rows]
+    return obstacles.points[rows] + offset_s[:, None] * rate[:3]
 
 
 class _Prediction(NamedTuple):
@@ -369,37 +390,38 @@ class _Prediction(NamedTuple):
     std: Float  # (3,) standard deviation of x, y (m) and yaw (rad)
 
 
-def _predict(track: Track, given_rate: Float, num: int, time_s: float) -> _Prediction:
-    """Predict an object's state from the ``num`` nearest ones, at constant speed and turn rate."""
+def _predict(track: Track, start_rate: Float, num_recent: int, time_s: float) -> _Prediction:
+    """Predict an object's state from the nearest states, at constant speed and turn rate."""
     # The velocity turns with the object (Schubert, Richter, Wanielik, "Comparison and Evaluation of
     # Advanced Motion Models for Vehicle Tracking", FUSION 2008).
     nearest_first = sorted(
         track.observations.items(), key=lambda item: (abs(item[1].seen_s - time_s), item[0])
     )
-    recent = dict(nearest_first[:num])
+    recent = dict(nearest_first[:num_recent])  # by batch index
     states = np.stack([observation.state for observation in recent.values()])
     times_s = np.array([observation.seen_s for observation in recent.values()])
     ahead_s = time_s - times_s[0]
     middle_s = times_s.mean()
-    rate = given_rate
+    rate = start_rate
     if len(times_s) > 1:
-        # A line through the states. The given velocity counts as long as the first observation is
-        # among the recent ones. It has no turn rate.
+        # Slope of the least-squares line through the states. The velocity at which the track
+        # started counts as a further measurement while the first observation is among the recent
+        # ones. It says nothing about the turn rate.
         centred_s = times_s - middle_s
         first_batch = next(iter(track.observations))
-        given_s2 = np.full(4, _GIVEN_S2 * (first_batch in recent))
-        given_s2[3] = 0
-        rate = (centred_s @ states + given_s2 * given_rate) / (centred_s @ centred_s + given_s2)
-        rate[3] *= _TURNS_ON
+        weight_s2 = np.full(4, _START_RATE_S2 * (first_batch in recent))
+        weight_s2[3] = 0
+        rate = (centred_s @ states + weight_s2 * start_rate) / (centred_s @ centred_s + weight_s2)
+        rate[3] *= _TURN_RATE_SHARE
     std = PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
-    # The line's rate is that of its middle. Between the nearest state and ``time_s``, the mean rate
-    # is that of the middle between them.
-    mean_rate = _turned(rate, time_s - 0.5 * ahead_s - middle_s)
-    return _Prediction(states[0] + mean_rate * ahead_s, _turned(rate, time_s - middle_s), std)
+    # The slope is the rate at the mean time of the states. At constant turn rate, the mean rate
+    # between the nearest state and ``time_s`` is the rate halfway between them.
+    mean_rate = _turn(rate, time_s - 0.5 * ahead_s - middle_s)
+    return _Prediction(states[0] + mean_rate * ahead_s, _turn(rate, time_s - middle_s), std)
 
 
-def _turned(rate: Float, later_s: float) -> Float:
-    """Return the rate (4,) of a state after ``later_s``, at constant speed and turn rate."""
-    cos, sin = np.cos(rate[3] * later_s), np.sin(rate[3] * later_s)
+def _turn(rate: Float, duration_s: float) -> Float:
+    """Return the rate (4,) of a state after a time, at constant speed and turn rate."""
+    cos, sin = np.cos(rate[3] * duration_s), np.sin(rate[3] * duration_s)
     x, y = rate[:2]
     return np.array([cos * x - sin * y, sin * x + cos * y, *rate[2:]])

@@ -14,7 +14,7 @@ import numpy as np
 from densify.config import Config
 from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times_s
-from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_known_at
+from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_tracked_at
 from densify.flow.tracking.objects import MovingObject, Shape, Track, near_m
 from densify.flow.tracking.soften import Snapshot, Softened, soften
 from densify.flow.tracking.tracks import find_tracks
@@ -25,7 +25,7 @@ from densify.geometry.compiled import num_threads
 from densify.geometry.nearest import nearest
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
-_FINE_M = 0.3  # ring gap up to which a limb has returns of several rings
+_MAX_BENDING_GAP_M = 0.3  # ring gap up to which a limb has returns of several rings: it can bend
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ class GroupMotion:
             track = self.tracks[k]
             seen_s = firing_times_s(self.stretch, i, rows)
             measured = poses.transform(registered.T_world_lidar, registered.sweep.points[rows])
+            # In the object's frame the points of a rigid object stay where they are.
             if k in self.bendings:
                 source_in_object, target_in_object = self.bendings[k].carry(i, j, clock, seen_s)
             else:
@@ -73,7 +74,7 @@ class GroupMotion:
             to_reference[rows] = (at_reference - measured) @ R_lidar_world.T
             displacement[rows] = (arrived - at_reference) @ R_lidar_world.T
             velocity_m_s[rows] = track.velocity_m_s(arrived, target_s) @ R_lidar_world.T
-            lost[rows] = not is_known_at(track, j, clock)
+            lost[rows] = not is_tracked_at(track, j, clock)
         moving = instance >= 0
         number = np.append(self.number, -1)[instance].astype(np.int32)
         return FlowField(displacement, moving, number, lost, to_reference, velocity_m_s)
@@ -87,7 +88,11 @@ class Bending:
     softened: Softened  # points of the object in each of these sweeps, and how the points bend
 
     def carry(self, i: int, j: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return (N,3) sweep i's points, object's frame, at the times of i and of j or nearest."""
+        """Return sweep i's N points at the reference times of sweeps i and j: two (N,3) arrays.
+
+        Both are in the object's frame; ``seen_s`` are the points' firing times. If the object has
+        no points in sweep j, it bends as in the nearest sweep that has some.
+        """
         source = self.sweeps.index(i)
         target = self.sweeps.index(clock.nearest(j, self.sweeps))
         points = self.softened.snapshots[source].points
@@ -98,14 +103,14 @@ class Bending:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Find all moving objects in the stretch, at any sweep rate: the engine ``groups``.
+    """Return the motion of all objects in the scene, at any sweep rate; takes no argument.
 
     Below 10 Hz, objects that turn, bend or are occluded between sweeps are tracked worse or lost.
     """
-    return motion_of(scene, scene.candidates)
+    return find_group_motion(scene, scene.candidates)
 
 
-def motion_of(
+def find_group_motion(
     scene: Scene,
     candidates: Sequence[Candidates],
     velocities_m_s: Sequence[Float] | None = None,
@@ -130,7 +135,7 @@ def motion_of(
         return [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in batch]
 
     def bend(k: int) -> Bending:
-        return _bending_of(k, tracks[k], stretch, moved_with)
+        return _find_bending(k, tracks[k], stretch, moved_with)
 
     with ThreadPoolExecutor(num_threads()) as pool:
         instance = tuple(chain.from_iterable(pool.map(assign_batch, space.batches)))
@@ -138,19 +143,21 @@ def motion_of(
         # Points move with the carrier of their track. The last entry, of index -1, is static.
         carrier_of_instance: Instance = np.append(carrier, -1).astype(np.int32)
         moved_with = tuple(carrier_of_instance[of_point] for of_point in instance)
-        fine = [
+        near_tracks = [
             k
             for k, track in enumerate(tracks)
-            if space.gap_m(track.centre, min(track.claimed)) <= _FINE_M
+            if space.gap_m(track.centre, min(track.claimed)) <= _MAX_BENDING_GAP_M
         ]
-        estimated = dict(zip(fine, pool.map(bend, fine), strict=True))
-    bendings = {
-        k: bending for k, bending in estimated.items() if np.isfinite(bending.softened.alpha)
-    }
+        # Objects of infinite stiffness are rigid.
+        bendings = {
+            k: bending
+            for k, bending in zip(near_tracks, pool.map(bend, near_tracks), strict=True)
+            if np.isfinite(bending.softened.alpha)
+        }
     return GroupMotion(stretch, tuple(tracks), moved_with, bendings, number)
 
 
-def _bending_of(k: int, track: Track, stretch: Stretch, instance: Sequence[Instance]) -> Bending:
+def _find_bending(k: int, track: Track, stretch: Stretch, instance: Sequence[Instance]) -> Bending:
     """Return the bending of the object with index k, from its points in all sweeps."""
     snapshots, sweeps = [], []
     for i, registered in enumerate(stretch.sweeps):
@@ -171,14 +178,16 @@ def _rows_by_track(instance: Instance) -> list[tuple[int, Int]]:
     return list(zip(tracks.tolist(), np.split(rows, begins)[1:], strict=True))
 
 
-_MOSTLY = 0.7  # least share of the common sweeps, or of the points of a piece
+_MIN_SHARE = 0.7  # least share of the common sweeps, or of a piece's points, that meet a condition
 _BUMPERS_M = 1.5  # moving traffic keeps a greater distance
-# Pieces of one object drift apart by less than this, or than their neighbour distance, within this
-# time of the middle of the common sweeps, plus this multiple of their paths' noise. The motion of a
-# flat side along itself is not known more accurately.
-_DRIFT_M, _BESIDE_S, _SIGMAS = 0.5, 0.5, 3.0
-_AS_LONG = 0.75  # share of an object's observations; the error of a velocity falls with time^1.5
-_SAME_M_S = 0.4  # twice the error of the velocity of a long track
+# Two pieces move alike if they drift apart by at most this distance (or their neighbour distance)
+# plus this multiple of the noise of their paths, within this time of the middle of the common
+# sweeps. The motion of a flat side along itself is not known more accurately.
+_DRIFT_M, _NUM_SIGMAS, _COMPARED_S = 0.5, 3.0, 0.5
+# A piece with its own motion needs this share of its object's observations: the error of a velocity
+# falls with time^1.5.
+_MIN_LENGTH_RATIO = 0.75
+_MAX_DIFFERENCE_M_S = 0.4  # twice the error of the velocity of a long track
 
 
 class JoinedObjects(NamedTuple):
@@ -218,43 +227,45 @@ def join_pieces(
     Args:
         instance: For each sweep, (N,) int32, the index of each point's track, -1 for static points.
     """
-    pieces = _pieces(stretch, tracks, instance, space)
+    pieces = _make_pieces(stretch, tracks, instance, space)
     number = np.arange(len(tracks))
     carrier = np.arange(len(tracks))
-    unjoined = sorted(pieces, key=lambda k: (-pieces[k].num_points, k))
-    while unjoined:
-        k = unjoined.pop(0)
+    # The piece with most points starts an object, which takes in pieces until none fits. The larger
+    # object may touch further pieces.
+    queue = sorted(pieces, key=lambda k: (-pieces[k].num_points, k))
+    while queue:
+        k = queue.pop(0)
         parts = [pieces[k]]
-        grows = True
-        while grows:
+        has_grown = True
+        while has_grown:
             clouds = [part.in_object(tracks[k], list(part.points)) for part in parts]
             moving_object = MovingObject(tracks[k], Shape.of(np.concatenate(clouds)))
             sweeps = set().union(*(part.points for part in parts))
-            added = [m for m in unjoined if _is_part(pieces[m], moving_object, sweeps, space)]
-            number[added] = k
-            for m in added:
+            new_parts = [m for m in queue if _is_part(pieces[m], moving_object, sweeps, space)]
+            number[new_parts] = k
+            for m in new_parts:
                 if not _has_own_motion(pieces[m], tracks[k], space):
                     carrier[m] = k
-            parts += [pieces[m] for m in added]
-            unjoined = [m for m in unjoined if m not in added]
-            grows = bool(added)
+            parts += [pieces[m] for m in new_parts]
+            queue = [m for m in queue if m not in new_parts]
+            has_grown = bool(new_parts)
     return JoinedObjects(number, carrier)
 
 
 def _has_own_motion(piece: _Piece, track: Track, space: FreeSpace) -> bool:
     """Return True if a piece's motion is as accurate as that of its object's ``track``."""
-    if len(piece.track.observations) < _AS_LONG * len(track.observations):
+    if len(piece.track.observations) < _MIN_LENGTH_RATIO * len(track.observations):
         return False  # a shorter path is less accurate
     middle = sorted(piece.points)[len(piece.points) // 2]
     at_s = space.clock.time_s[middle]
     positions = piece.track.place(piece.in_object(piece.track, [middle]), at_s)
     difference_m_s = piece.track.velocity_m_s(positions, at_s) - track.velocity_m_s(positions, at_s)
-    # The velocity of a flat side along itself is wrong by more than 0.4 m/s. Half a turning truck
-    # differs by less.
-    return bool(np.linalg.norm(difference_m_s[:, :2], axis=1).max() <= _SAME_M_S)
+    # Along a flat side the velocity may be wrong by more than 0.4 m/s. Then the piece moves better
+    # with the object. The two halves of a turning truck differ by less.
+    return bool(np.linalg.norm(difference_m_s[:, :2], axis=1).max() <= _MAX_DIFFERENCE_M_S)
 
 
-def _pieces(
+def _make_pieces(
     stretch: Stretch, tracks: Sequence[Track], instance: Sequence[Instance], space: FreeSpace
 ) -> dict[int, _Piece]:
     """Return the piece of each track with points, by index in ``tracks``; see `join_pieces`."""
@@ -278,7 +289,7 @@ def _is_part(
     # One of three rules must hold:
     # 1. The piece touches the object in most common sweeps, and lies in the object's box.
     # 2. The piece touches the object in most common sweeps, and moves alike.
-    # 3. The piece moves alike, in the object's lane, closely ahead of or behind the object.
+    # 3. The piece moves alike in the object's lane, ahead of or behind the object without a gap.
     common = sorted(sweeps & piece.points.keys())
     if not common:
         return False
@@ -288,24 +299,25 @@ def _is_part(
         return False
     is_touching = _touches(piece, moving_object, common)
     if is_touching and _lies_in_box(piece, moving_object, common, middle_s):
-        return True
+        return True  # rule 1
 
     neighbour_m = float(np.median(np.concatenate([piece.near_m[i] for i in common])))
     tolerance_m = max(_DRIFT_M, neighbour_m)
     positions = piece.track.place(piece.in_object(piece.track, common), middle_s)
-    near_middle = [i for i in common if space.clock.near(i, middle, _BESIDE_S)]
+    near_middle = [i for i in common if space.clock.near(i, middle, _COMPARED_S)]
     ends_s = space.clock.time_s[[near_middle[0], near_middle[-1]]]
     tracks = piece.track, moving_object.track
     if not _move_alike(tracks, positions, middle_s, ends_s, tolerance_m):
         return False
     if is_touching:
-        return True
+        return True  # rule 2
+
     gap_m = _gap_in_lane_m(positions, moving_object, middle_s)
     if gap_m > _BUMPERS_M:
         return False
     if gap_m <= tolerance_m:
         return True
-    # Two vehicles in a queue have free space between them.
+    # A larger gap may be a part without returns. Between two vehicles it is seen through.
     in_object = moving_object.track.undo(positions, middle_s)
     return not _is_seen_between(in_object, moving_object, common, space)
 
@@ -328,7 +340,7 @@ def _touches(piece: _Piece, moving_object: MovingObject, sweeps: Sequence[int]) 
         in_object = piece.in_object(moving_object.track, [i])
         is_close = nearest(shape.tree, in_object)[0] < piece.near_m[i]
         is_touching.append((is_close | shape.within_outline(in_object)).any())
-    return bool(np.mean(is_touching) >= _MOSTLY)
+    return bool(np.mean(is_touching) >= _MIN_SHARE)
 
 
 def _lies_in_box(
@@ -344,19 +356,19 @@ def _lies_in_box(
         along_m = positions[:, :2] @ lane.ahead
         is_beside = (along_m >= object_along_m.min()) & (along_m <= object_along_m.max())
         is_inside.append(lane.holds(positions) & is_beside)
-    return bool(np.concatenate(is_inside).mean() >= _MOSTLY)
+    return bool(np.concatenate(is_inside).mean() >= _MIN_SHARE)
 
 
 def _move_alike(
     tracks: tuple[Track, Track], points: Float, at_s: float, ends_s: Float, tolerance_m: float
 ) -> bool:
-    """Return True if two tracks carry (N,3) points from one time to nearly the same positions."""
+    """Return True if two tracks carry (N,3) points to nearly the same positions at other times."""
     track, other_track = tracks
     drift = [
         other_track.carry(points, at_s, end_s) - track.carry(points, at_s, end_s)
         for end_s in ends_s
     ]
-    noise_m = _SIGMAS * np.hypot(other_track.path.residual_m, track.path.residual_m)
+    noise_m = _NUM_SIGMAS * np.hypot(other_track.path.residual_m, track.path.residual_m)
     drift_m = np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max()
     return bool(drift_m <= tolerance_m + noise_m)
 
@@ -365,7 +377,7 @@ def _gap_in_lane_m(positions: Float, moving_object: MovingObject, at_s: float) -
     """Return the gap along the lane between an object and (N,3) points, infinite outside it."""
     track, shape = moving_object
     lane = moving_object.lane(at_s)
-    if lane.holds(positions).mean() < _MOSTLY:
+    if lane.holds(positions).mean() < _MIN_SHARE:
         return np.inf
     along_m = positions[:, :2] @ lane.ahead
     object_along_m = track.place(shape.points, at_s)[:, :2] @ lane.ahead
@@ -376,7 +388,7 @@ def _is_seen_between(
     points: Float, moving_object: MovingObject, sweeps: Sequence[int], space: FreeSpace
 ) -> bool:
     """Return True if a sweep saw through the middle between an object and (N,3) points."""
-    # All are in the object's frame: the nearest point of the piece, and of the object
+    # Middle between the closest points of the piece and of the object, in the object's frame
     distance_m, neighbour = nearest(moving_object.shape.tree, points)
     closest = distance_m.argmin()
     ends = points[closest], moving_object.shape.points[neighbour[closest]]

@@ -25,9 +25,9 @@ from densify.geometry.types import Bool, Float
 _NUM_STATES = 3  # fewer states always lie on a line
 NUM_ASKED = 60
 """Greatest number of tested points of a batch."""
-_GIVEN = 5.0  # added to both counts of a ratio, because few observations are weak evidence
+_PRIOR_COUNT = 5.0  # added to both counts of a ratio, because few observations are weak evidence
 _CLEARLY = 1.0  # difference of the log odds of two motions that exceeds noise
-_ROUGH = 0.1  # accuracy of a state, as a share of the neighbour distance
+_MIN_ROUGHNESS = 0.1  # accuracy of a state, as a share of the neighbour distance
 
 _FILE = Path(__file__).with_name("likelihood.json")
 
@@ -48,7 +48,7 @@ class Places(NamedTuple):
 
     def log_occupied(self) -> float:
         """Return the log odds that a position is occupied, near 0 for few observations."""
-        return float(np.log((self.num_occupied + _GIVEN) / (self.num_free + _GIVEN)))
+        return float(np.log((self.num_occupied + _PRIOR_COUNT) / (self.num_free + _PRIOR_COUNT)))
 
 
 class Violations(NamedTuple):
@@ -70,7 +70,12 @@ class Evidence(NamedTuple):
     slenderness: float  # ratio of extent along the motion to height, at least 1
 
     def terms(self) -> dict[str, float]:
-        """Return the value of each term of the log odds, by its name in ``likelihood.json``."""
+        """Return the value of each term of the log odds, by its name in ``likelihood.json``.
+
+        ``removed`` and ``left`` compare violations of the moved and the static track.
+        ``travelled``, ``rough`` and ``slender`` describe path and shape. ``taken`` and ``taken
+        too`` tell if positions that a moving object vacates hold something else.
+        """
         static, moved, tests = self.violations
         less_occupied, more_occupied = sorted(
             [self.before.log_occupied(), self.after.log_occupied()]
@@ -79,15 +84,15 @@ class Evidence(NamedTuple):
             # Number of violations that the motion removes, as a share of the tests
             "removed": float(np.log((max(static - moved, 0) + 1) / (tests + 1))),
             # Number of violations that the motion leaves, as a share of those of a static object
-            "left": float(np.log((moved + _GIVEN) / (static + _GIVEN))),
-            # Distance that the object travels
-            "travelled": float(np.log(self.distance + _ROUGH)),
+            "left": float(np.log((moved + _PRIOR_COUNT) / (static + _PRIOR_COUNT))),
+            # Distance that the object travels; the constant keeps the logarithm finite
+            "travelled": float(np.log(self.distance + _MIN_ROUGHNESS)),
             # Scatter of the states about the smooth path
-            "rough": float(np.log(self.roughness + _ROUGH)),
-            # Log odds that vacated positions hold returns of something else: before the object
-            # arrives or after it leaves, whichever is less
+            "rough": float(np.log(self.roughness + _MIN_ROUGHNESS)),
+            # The lesser of two log odds that positions of the object hold something else: before it
+            # arrives there, and after it leaves
             "taken": less_occupied,
-            # Whichever is greater. It has less weight, because the rest of a long object may be
+            # The greater of the two. It has less weight, because the rest of a long object may be
             # there.
             "taken too": more_occupied,
             # Length relative to height
@@ -95,7 +100,7 @@ class Evidence(NamedTuple):
         }
 
     def log_odds(self, table: Mapping[str, float]) -> float:
-        """Return the log odds that the track moves, by the weights and ``price`` of `own_table`."""
+        """Return the log odds that the track moves, by the table of `fitted_weights`."""
         return sum(table[name] * value for name, value in self.terms().items()) - table["price"]
 
 
@@ -103,7 +108,7 @@ class Verdict(NamedTuple):
     """The log odds that a track moves."""
 
     log_odds: float  # log odds that the track moves; above 0 it is confirmed
-    at_most: float  # log odds that the track would have if its motion left no violations
+    best_log_odds: float  # log odds that the track would have if its motion left no violations
 
     @property
     def moves(self) -> bool:
@@ -142,19 +147,22 @@ def judge(
         track.path.residual_m / within_m,
         _slenderness(track, obstacles, within_m),
     )
-    # Vacated positions cost most time. They are skipped if the other terms already reject.
-    if record is not None or evidence.log_odds(own_table()) > 0:
-        before, after = find_places_left(track, obstacles, space, objects, within_m)
+    # Observations at vacated positions cost most time. So far they are assumed to favour motion.
+    # They are skipped if the other terms reject the track even then.
+    weights = fitted_weights()
+    if record is not None or evidence.log_odds(weights) > 0:
+        before, after = count_vacated_places(track, obstacles, space, objects, within_m)
         evidence = evidence._replace(before=before, after=after)
     if record is not None:
         record(track, evidence)
     without_violations = evidence._replace(violations=violations._replace(moved=0))
-    return Verdict(evidence.log_odds(own_table()), without_violations.log_odds(own_table()))
+    return Verdict(evidence.log_odds(weights), without_violations.log_odds(weights))
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
     """Count how often other sweeps see through sampled track points, as static and as moved."""
-    tested_rows = {}  # by sweep index
+    # Sample at most 60 points of each batch, by sweep index.
+    tested_rows = {}
     for batch in space.batches:
         num_per_sweep = NUM_ASKED // len(batch)
         for i in batch:
@@ -168,13 +176,14 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
     static = moved = num_tests = 0
     for batch in space.batches:
         observer = batch[0]  # the first sweep stands for its batch
+        # Sweeps whose points this sweep can test
         sources = [i for i in tested_rows if observer in observers[i]]
         if not sources:
             continue
         at_s = space.clock.time_s[observer]
         carried = track.place(np.concatenate([in_object[i] for i in sources]), at_s)
         measured = np.concatenate([points[i] for i in sources])
-        # One test of both positions of each point, moved and static
+        # One call tests both positions of each point: moved with the track, and as measured.
         positions = np.concatenate([carried, measured])
         carried_m_s = track.velocity_m_s(carried, at_s)
         velocity_m_s = np.concatenate([carried_m_s, np.zeros_like(carried)])
@@ -192,17 +201,18 @@ def _slenderness(track: Track, obstacles: Sequence[Obstacles], within_m: float) 
     motion = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
     length_m = float(np.ptp(points[:, :2] @ motion)) / max(float(np.hypot(*motion)), 1e-9)
     height_m = float(np.ptp(points[:, 2]))
-    return max(1.0, length_m / (height_m + within_m))  # the height is accurate to within_m
+    # The height is known to the neighbour distance only, which also avoids a division by 0.
+    return max(1.0, length_m / (height_m + within_m))
 
 
-def find_places_left(
+def count_vacated_places(
     track: Track,
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
     objects: Sequence[MovingObject],
     within_m: float,
 ) -> tuple[Places, Places]:
-    """Count what was observed at an object's positions before its arrival, and after it left.
+    """Count what other sweeps observed at an object's positions while it was elsewhere.
 
     Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
     through from some directions only. Its vacated positions then hold returns of the fence.
@@ -225,19 +235,21 @@ def find_places_left(
     sweep_of_position = np.repeat(sweeps, [len(sample) for sample in samples])
     tree = tree_of(track.points_in(obstacles, sweeps))
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
-    # Positions that the object left longer ago do not count.
+    # Positions that the object left longer than `REACH_S` ago do not count.
     reach_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
     before = after = Places(0, 0)
     for batch in space.batches:
         first, last = batch[0], batch[-1]
         in_object = track.undo(positions, space.clock.time_s[first])
         distance_m, _ = nearest(tree, in_object, reach_m)
+        # The distance is infinite beyond ``reach_m``. Positions measured in this batch itself are
+        # not vacated.
         is_vacated = (distance_m > LINK_M) & np.isfinite(distance_m)
         is_vacated &= (sweep_of_position < first) | (sweep_of_position > last)
         if not is_vacated.any():
             continue
         vacated = positions[is_vacated]
-        is_after = sweep_of_position[is_vacated] < first
+        is_after = sweep_of_position[is_vacated] < first  # the object has left already
         returns = [_returns_near(vacated, within_m, obstacles[j], objects) for j in batch]
         is_occupied = is_near(tree_of(np.concatenate(returns)), vacated, within_m)
         is_free = space.seen_through(vacated, first) & ~is_occupied
@@ -262,7 +274,7 @@ def _returns_near(
 
 
 @cache
-def own_table() -> Mapping[str, float]:
-    """Return the package's weights by the name of the term, and ``price``."""
+def fitted_weights() -> Mapping[str, float]:
+    """Return the fitted weight of each term by its name, and the ``price``."""
     weights: Mapping[str, float] = read_json(_FILE)["weights"]
     return weights

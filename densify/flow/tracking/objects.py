@@ -27,7 +27,7 @@ from densify.geometry.types import Bool, Float, Int
 _KNOT_S = 0.1
 # (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03 and 10 m/s³.
 _STIFFNESSES = (1e6, 10.0)
-_WORTH_SOFTENING = 0.8  # a softer path must lower the leave-one-out error to this share
+_MAX_ERROR_RATIO = 0.8  # greatest leave-one-out error of a softer path, by that of a stiffer one
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
 MIN_STATES, _JERK_STATES = 5, 8
 MIN_SPAN_S, _JERK_S = (_KNOT_S * (num - 1.5) for num in (MIN_STATES, _JERK_STATES))
@@ -68,9 +68,11 @@ class Path:
         width_s = duration_s / num_spans
         knots: Float = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1.0)
         last_s = min(end_s, knots[-_DEGREE - 1])  # rounding may put the last knot before the end
-        inside = np.clip(times_s, begin_s, np.nextafter(last_s, begin_s))
-        B = BSpline.design_matrix(inside, knots, _DEGREE).toarray()
-        # D: differences of the coefficients, whose squares are penalised
+        # The splines are defined before the last knot only.
+        clipped_s = np.clip(times_s, begin_s, np.nextafter(last_s, begin_s))
+        B = BSpline.design_matrix(clipped_s, knots, _DEGREE).toarray()  # (m,n) values of n splines
+        # D: differences of the coefficients, whose squares are penalised. Third differences are 0
+        # at constant acceleration, second differences at constant velocity.
         may_accelerate = num_states >= MIN_STATES and duration_s >= MIN_SPAN_S
         D = np.diff(np.eye(B.shape[1]), 3 if may_accelerate else 2, axis=0)
         W = weights / weights.mean()
@@ -83,11 +85,13 @@ class Path:
             # Linear map from the states to the coefficients of the penalised fit
             fit_matrix = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
             trial = fit_matrix @ states
+            # The diagonal of the map from the states to the fitted states. A state's deviation from
+            # the fit without this state is its deviation / (1 - leverage).
             leverage = np.einsum("ij,ji->i", B, fit_matrix)
             deviation_m = np.linalg.norm((states - B @ trial)[:, :2], axis=1)
             left_out_m = deviation_m / np.maximum(1 - leverage, 1e-3)
             error_m = float(np.sqrt(np.average(left_out_m**2, weights=W)))
-            if error_m < _WORTH_SOFTENING * least_error_m:
+            if error_m < _MAX_ERROR_RATIO * least_error_m:
                 # The leverages sum to the number of fitted parameters. Half a degree of freedom
                 # remains at least.
                 freedom = max(num_states - leverage.sum() - 0.5, 0.5)
@@ -102,9 +106,10 @@ class Path:
         """The path as polynomials in time; the first and the last piece are its ends' tangents."""
         num_spans = len(self.coefficients) - _DEGREE
         width_s = (self.end_s - self.begin_s) / num_spans
+        # Span k is a cubic polynomial of the coefficients k to k + 3.
         controls = np.stack([self.coefficients[k : k + num_spans] for k in range(_DEGREE + 1)])
         cubic = np.einsum("pk,knd->pnd", _CUBIC, controls)
-        # Rows are powers 3 to 0 of the time since the piece began, in units of a span.
+        # Rows are the powers 3 to 0 of the time since the piece began, in units of a span.
         linear, constant = 2, 3
         first, last = np.zeros((2, _DEGREE + 1, 1, cubic.shape[2]))
         # The first piece begins one span before the path, and ends with its value and slope.
@@ -112,7 +117,8 @@ class Path:
         first[constant] = cubic[constant, :1] - first[linear]
         # The last piece begins with the value and the slope at the end of the path.
         last[constant] = cubic[:, -1:].sum(axis=0)
-        last[linear] = np.arange(3.0, -1.0, -1) @ cubic[:, -1]
+        last[linear] = np.arange(3.0, -1.0, -1) @ cubic[:, -1]  # derivative of the powers, at 1
+        # From units of a span to seconds
         powers = width_s ** -np.arange(_DEGREE, -1.0, -1)
         pieces = np.concatenate([first, cubic, last], axis=1) * powers[:, None, None]
         return PPoly(pieces, self.begin_s + width_s * np.arange(-1.0, num_spans + 2))
@@ -132,7 +138,8 @@ class Path:
         return float(np.linalg.norm((self(self.end_s) - self(self.begin_s))[:2]))
 
 
-_NEAR_M, _NEAR_GAPS = 0.2, 0.5  # least neighbour distance, and its share of the ring gap
+# Neighbour distance: least one, for noise and errors of registration, and share of the ring gap
+_NEAR_M, _NEAR_GAPS = 0.2, 0.5
 _MANY_POINTS = 100  # more points do not locate an object better
 BESIDE_M = 1.0  # from a towing vehicle to its trailer, and from an object to the road
 _OUTLINE_M = 0.05  # distance outside an outline that still counts as inside
@@ -147,7 +154,7 @@ _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
 def near_m(gap_m: Float | float) -> Any:
-    """Return how far apart (m) two returns of one place may lie, by the gap of rings; any shape."""
+    """Return the neighbour distance: how far apart (m) returns of one spot are, by the ring gap."""
     return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
 
 
@@ -215,13 +222,14 @@ class Track:
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
         """Return the velocities (N,3), world, of the object's points (N,3, world) at a time."""
         state, rate = self.path(time_s), self.path.rate(time_s)
+        # Velocity of the centre, plus the turn rate times the distance from the centre
         velocity_m_s = np.tile(rate[:3], (len(points), 1))
         velocity_m_s[:, 0] -= rate[3] * (points[:, 1] - self.centre[1] - state[1])
         velocity_m_s[:, 1] += rate[3] * (points[:, 0] - self.centre[0] - state[0])
         return velocity_m_s
 
     def seen_through(self, points: Float, j: int, space: FreeSpace) -> Bool:
-        """Return (N,) True where sweep j sees through points (N,3, object's frame) moved to it."""
+        """Return (N,) True for points (N,3, object's frame) that, moved, sweep j sees through."""
         at_s = space.clock.time_s[j]
         carried = self.place(points, at_s)
         return space.seen_through(carried, j, self.velocity_m_s(carried, at_s))
@@ -239,7 +247,7 @@ class Track:
         """Return the indices, in the batch's obstacles, of the object's points."""
         sweeps = zip(batch.sweeps, batch.begins, strict=True)
         rows = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
-        return np.concatenate([np.zeros(0, np.int64), *rows])  # there may be none
+        return np.concatenate([np.zeros(0, np.int64), *rows])  # the first part: for no rows
 
     def num_points(self, n: int) -> int:
         """Return the number of the object's points in batch index n."""
@@ -254,9 +262,9 @@ class Track:
         return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
-        """Return how much higher (m) the ground is below a state (4,) than at first."""
-        # The median of three lines, in the middle and 1 m to both sides: the road below an object
-        # may never be observed.
+        """Return how much (m) the ground rises from the first position to that of a state (4,)."""
+        # The median over three lines along the motion, in the middle and 1 m to both sides: the
+        # road below an object may never be observed.
         ahead = state[:2] / max(float(np.linalg.norm(state[:2])), 1e-9)
         start = self.centre[:2] + np.outer([-BESIDE_M, 0.0, BESIDE_M], [-ahead[1], ahead[0]])
         start_m, end_m = ground.under(np.concatenate([start, start + state[:2]])).reshape(2, -1)
@@ -265,11 +273,11 @@ class Track:
     def seen_at(self, time_ns: int) -> float:
         """Estimate when (s) the sweep with reference time ``time_ns`` measures the object."""
         # Both times count from the first sweep. The delay from the reference time to the firing
-        # time is that of the observation nearest in time.
-        _, nearest = min(
+        # time is that of the observation nearest in time, of two equally near the earlier one.
+        _, observation = min(
             self.observations.items(), key=lambda item: (abs(item[1].time_ns - time_ns), item[0])
         )
-        return time_ns * 1e-9 + nearest.seen_s - nearest.time_ns * 1e-9
+        return time_ns * 1e-9 + observation.seen_s - observation.time_ns * 1e-9
 
 
 @dataclass(frozen=True)
@@ -309,8 +317,8 @@ class Shape:
     @cached_property
     def side_rad(self) -> float:
         """The direction of one side seen from above, in [0, pi / 2), object's frame."""
-        # Other sides are taken as parallel or perpendicular: histograms of the points along both
-        # axes are most peaked (greatest sum of squares).
+        # The sides of a vehicle are parallel or perpendicular. Along the axes of the sides,
+        # histograms of the points are most peaked (greatest sum of squares).
         points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
         points = points - points.mean(axis=0)
         reach_m = float(np.linalg.norm(points, axis=1).max())
@@ -337,6 +345,7 @@ class MovingObject(NamedTuple):
 
     def may_be_near(self, points: Float, time_s: float | Float, within_m: float) -> bool:
         """Return False if the boxes around the object and (N,3) world points are apart."""
+        # The object is placed at the mean time. Its motion until the other times widens the box.
         at_s = float(np.mean(time_s))
         travel_m = float(np.ptp(time_s) * np.linalg.norm(self.track.path.rate(at_s)[:2]))
         rim = self.track.place(self.shape.rim, at_s)
@@ -346,8 +355,8 @@ class MovingObject(NamedTuple):
     def heading(self, at_s: float) -> Float:
         """Return (2,) the unit vector along the object at a time, world.
 
-        Beyond 3 m it is the side closest to the velocity, because a turning trailer does not move
-        where it points; for shorter objects it is the velocity.
+        For objects longer than 3 m it is the direction of the side closest to the velocity, because
+        a turning trailer does not move where it points. For others it is that of the velocity.
         """
         velocity_m_s = self.track.path.rate(at_s)[:2]
         direction = velocity_m_s / max(float(np.linalg.norm(velocity_m_s)), 1e-6)

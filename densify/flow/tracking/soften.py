@@ -21,8 +21,10 @@ from densify.flow.tracking.objects import LONG_M, MIN_SPAN_S, MIN_STATES
 from densify.geometry.nearest import nearest, nearest_k, tree_of
 from densify.geometry.types import Float, Int
 
-_ALPHAS = tuple(np.geomspace(100.0, 0.5, 7).tolist())  # from stiff to soft
-_REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))  # targets farther away do not pull
+# Levels from stiff to soft: weight of smoothness, greatest distance of a target that pulls, and
+# standard deviation of the blur
+_ALPHAS = tuple(np.geomspace(100.0, 0.5, 7).tolist())
+_REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))
 _BLURS_M = np.geomspace(0.2, 0.08, len(_ALPHAS))
 # One node per voxel: otherwise dense regions would be stiffer than sparse regions.
 _NODE_M = 0.07
@@ -63,7 +65,8 @@ class Softened:
 
     def velocity_m_s(self, i: int) -> Float:
         """Return (n,3) velocities of snapshot i relative to the rigid motion, object's frame."""
-        # The mean of the velocities to the next and from the previous snapshot
+        # The mean of the velocities to the next and from the previous snapshot. On the way to the
+        # previous one both the displacement and the duration change their sign.
         velocities = []
         for j, displacement in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
             if 0 <= j < len(self.snapshots):
@@ -83,7 +86,7 @@ class Softened:
         else:
             step, onward, back = -1, self.to_previous, self.to_next
         # At each snapshot in between, a point continues like the nearby points of that snapshot
-        # which arrived by a similar displacement.
+        # which arrived by a similar displacement: a hand that passes the hip moves on as a hand.
         displacement = onward[i]
         for k in range(i + step, j, step):
             points = points + displacement
@@ -114,11 +117,12 @@ def soften(snapshots: Sequence[Snapshot]) -> Softened:
     if not len(confirmed):
         return Softened(snapshots, zero, zero, np.inf, held_out_m)
     softest = int(confirmed[-1]) - 1  # column 0 is the rigid object
-    bending = _Bending(snapshots)
+    # Again with all snapshots, from the stiffest level down to the confirmed one
+    bending = _FlowSolver(snapshots)
     for k in range(softest + 1):
         bending.fill_targets()
         bending.refine(k)
-    to_next, to_previous = _average_both_ways(snapshots, *bending.at_points())
+    to_next, to_previous = _average_with_reverse(snapshots, *bending.at_points())
     return Softened(snapshots, to_next, to_previous, _ALPHAS[softest], held_out_m)
 
 
@@ -137,10 +141,11 @@ def _held_out_errors(snapshots: tuple[Snapshot, ...]) -> Float:
     # Row i belongs to snapshot i + 1: the first and the last snapshot cannot be predicted. Column 0
     # is the rigid object, column k has alpha k - 1.
     squared_m2 = np.zeros((len(snapshots) - 2, 1 + len(_ALPHAS)))
+    # Snapshots with even index predict those with odd index, and the other way round.
     for first in (0, 1):
         used = snapshots[first::2]
         held_out = snapshots[first + 1 :: 2]
-        bending = _Bending(used)
+        bending = _FlowSolver(used)
         for k in range(1 + len(_ALPHAS)):
             if k > 0:
                 bending.refine(k - 1)
@@ -157,8 +162,8 @@ def _mean_squared_m2(points: Float, predicted: Float) -> float:
     return float((to_predicted_m**2).mean() + (to_points_m**2).mean()) / 2
 
 
-class _Bending:
-    """Solver of the flow from each snapshot to the next and to the previous one."""
+class _FlowSolver:
+    """Solver of the flow of nodes (points thinned by voxels) to the next and previous snapshot."""
 
     def __init__(self, snapshots: tuple[Snapshot, ...]) -> None:
         self._snapshots = snapshots
@@ -166,7 +171,8 @@ class _Bending:
         # A hop (a, b) leads from snapshot a to the next or the previous snapshot b.
         num = len(snapshots)
         self._hops = [(i, i + 1) for i in range(num - 1)] + [(i, i - 1) for i in range(1, num)]
-        # The nodes of all hops lie side by side, 10 m apart, and are solved at once.
+        # All hops are solved at once. Their nodes are shifted apart along x by 10 m more than the
+        # object's extent, hence neighbours are always of the same hop.
         extent_m = float(np.ptp(np.concatenate(self._nodes), axis=0).max())
         self._shift_m = extent_m + 10.0
         # First node of each hop, and the number of all nodes
@@ -174,12 +180,12 @@ class _Bending:
         self._source = self._side_by_side([self._nodes[a] for a, _ in self._hops])
         self._laplacian = _laplacian(self._source)
         self._neighbours = nearest_k(tree_of(self._source), self._source, _NUM_BLURRED)[1]
-        self._velocity_penalty = self._velocity_change()
+        self._velocity_penalty = self._velocity_penalty_matrix()
         self._flow = np.zeros_like(self._source)  # (nodes, 3) relative to the rigid motion
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
 
     def refine(self, k: int) -> None:
-        """Match all nodes again, and solve for the flow, in place; alpha k = 0 is the stiffest."""
+        """Match all nodes again, and solve for the flow of level k, in place; 0 is the stiffest."""
         # Minimise, for fixed target flows t:
         # Σ w |f - t|² + Σ a |f|² + velocity penalty + alpha tr(Fᵀ L F)
         # The anchor a holds a node until it clearly left the rigid position (Geman, McClure 1987).
@@ -194,6 +200,8 @@ class _Bending:
         moved = self._source + self._flow
         neighbours = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
         target_mean, distance_m = _blur(self._target, neighbours, moved, _BLURS_M[k])
+        # A mean is biased towards the inside at an edge or beside a hole. The bias of the object's
+        # own mean is the same, and cancels.
         source_mean, _ = _blur(moved, self._neighbours, moved, _BLURS_M[k])
         weight = np.clip(1 - (distance_m / _REACHES_M[k]) ** 2, 0, 1) ** 2  # Tukey
         return self._flow + target_mean - source_mean, weight
@@ -202,18 +210,12 @@ class _Bending:
         """Solve for the flow, in place, by conjugate gradients with a Jacobi preconditioner."""
         jacobi = diags_array(1 / (matrix.diagonal() + 1e-9))
         for axis in range(3):
-            start = self._flow[:, axis]
-            residual = right_side[:, axis] - matrix @ start
+            start, wanted = self._flow[:, axis], right_side[:, axis]
+            residual = wanted - matrix @ start
             # Matches are provisional: a full solution is not needed.
             tolerance = _RESIDUAL_DROP * float(np.linalg.norm(residual))
             self._flow[:, axis], _ = cg(
-                matrix,
-                right_side[:, axis],
-                start,
-                rtol=0.0,
-                atol=tolerance,
-                maxiter=_MAX_PRODUCTS,
-                M=jacobi,
+                matrix, wanted, start, rtol=0.0, atol=tolerance, maxiter=_MAX_PRODUCTS, M=jacobi
             )
 
     def fill_targets(self) -> None:
@@ -222,9 +224,9 @@ class _Bending:
         targets = []
         for a, b in self._hops:
             clouds = [self._nodes[b]]
-            after = 2 * b - a  # the snapshot that follows in the direction of the hop
-            if (after, b) in flows:
-                clouds.append(self._nodes[after] + flows[after, b])
+            following = 2 * b - a  # the snapshot after b in the direction of the hop
+            if (following, b) in flows:
+                clouds.append(self._nodes[following] + flows[following, b])
             targets.append(np.concatenate(clouds))
         self._target = self._side_by_side(targets)
 
@@ -245,10 +247,10 @@ class _Bending:
         for (a, b), flow in self._by_hop().items():
             nodes = self._nodes[a]
             points = self._snapshots[a].points
-            # by position alone: all last displacements are given as 0
-            no_points_moved = np.zeros_like(points)
-            no_nodes_moved = np.zeros_like(nodes)
-            point_flow = _interpolate(points, no_points_moved, nodes, no_nodes_moved, flow)
+            # With equal displacements, 0, the nearest nodes are chosen by position alone.
+            no_displacement = np.zeros_like(points)
+            no_node_displacement = np.zeros_like(nodes)
+            point_flow = _interpolate(points, no_displacement, nodes, no_node_displacement, flow)
             if b > a:
                 to_next[a] = point_flow
             else:
@@ -265,12 +267,14 @@ class _Bending:
             [cloud + [k * self._shift_m, 0.0, 0.0] for k, cloud in enumerate(clouds)]
         )
 
-    def _velocity_change(self) -> csr_array:
+    def _velocity_penalty_matrix(self) -> csr_array:
         """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_before / dt_before|²``."""
-        # f: displacements to the next and the previous snapshot; the sum is 0 at constant velocity
+        # f: displacements of a node to the next and the previous snapshot. At constant velocity
+        # they have opposite signs, and the sum is 0.
         number = {hop: k for k, hop in enumerate(self._hops)}
         times_s = [snapshot.time_s for snapshot in self._snapshots]
-        # The node that leads from the same point to the other side; without one, the node itself
+        # Row of the same node in the hop to the other side. Without such a hop it is the node's own
+        # row, with weight 0.
         opposite = np.arange(len(self._source))
         diagonal, coupling = np.zeros((2, len(self._source)))
         for (a, b), k in number.items():
@@ -281,7 +285,7 @@ class _Bending:
             opposite[rows] = np.arange(self._begins[opposite_hop], self._begins[opposite_hop + 1])
             rate = 1 / abs(times_s[b] - times_s[a])
             opposite_rate = 1 / abs(times_s[2 * a - b] - times_s[a])
-            # a weight of 1 for equal times
+            # The mean weight of both hops is 1, for any times.
             scale = 2 / (rate * rate + opposite_rate * opposite_rate)
             diagonal[rows] = scale * rate * rate
             coupling[rows] = scale * rate * opposite_rate
@@ -305,7 +309,7 @@ def _laplacian(points: Float) -> csr_array:
     return csr_array((diags_array(degree) - weights) / degree.mean())
 
 
-def _average_both_ways(
+def _average_with_reverse(
     snapshots: tuple[Snapshot, ...], to_next: tuple[Float, ...], to_previous: tuple[Float, ...]
 ) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
     """Return both flows, each averaged with the reversed flow of the points where it arrives."""
@@ -315,7 +319,7 @@ def _average_both_ways(
         reversed_flow = _interpolate(arrived, flow, snapshots[b].points, -reverse, -reverse)
         return (flow + reversed_flow) / 2
 
-    last = len(snapshots) - 1
+    last = len(snapshots) - 1  # without a next snapshot; the first one has no previous snapshot
     forth = [average(i, i + 1, to_next[i], to_previous[i + 1]) for i in range(last)]
     back = [average(i + 1, i, to_previous[i + 1], to_next[i]) for i in range(last)]
     return (*forth, to_next[last]), (to_previous[0], *back)
@@ -328,14 +332,15 @@ def _one_per_voxel(points: Float) -> Int:
 
 
 def _blur(points: Float, neighbours: Int, positions: Float, blur_m: float) -> tuple[Float, Float]:
-    """Return, at (N,3) positions, the Gaussian mean of neighbours (N,k) and nearest distance."""
+    """Return (N,3) Gaussian means of each position's neighbours, and (N,) nearest distances."""
     neighbour_points = points[neighbours]
     offset = neighbour_points - positions[:, None]
     squared = np.einsum("nki,nki->nk", offset, offset)
-    least_squared = squared.min(axis=1)
-    weight = np.exp((least_squared[:, None] - squared) / (2 * blur_m**2))
+    nearest_squared = squared.min(axis=1)
+    # Relative to the nearest neighbour, hence the weights never all vanish
+    weight = np.exp((nearest_squared[:, None] - squared) / (2 * blur_m**2))
     weight /= weight.sum(axis=1, keepdims=True)
-    return np.einsum("nk,nki->ni", weight, neighbour_points), np.sqrt(least_squared)
+    return np.einsum("nk,nki->ni", weight, neighbour_points), np.sqrt(nearest_squared)
 
 
 def _interpolate(

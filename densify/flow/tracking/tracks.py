@@ -24,8 +24,8 @@ from densify.flow.tracking.following import (
     DistanceField,
     Follower,
     Group,
+    find_nearby_velocities,
     find_starts,
-    velocities_beside,
     vote,
 )
 from densify.flow.tracking.likelihood import NUM_ASKED, RecordEvidence, Verdict, judge
@@ -38,10 +38,10 @@ from densify.geometry.clock import Clock
 from densify.geometry.nearest import link
 from densify.geometry.types import Bool, Float, Int
 
-_NEAR_S = 0.3  # time to the sweeps that test a motion
-_REFINED_STD = PREDICTION_STD / 2  # standard deviation of the smooth motion
+_NEAR_S = 0.3  # greatest time to the sweeps that test a motion
+_PATH_STD = PREDICTION_STD / 2  # standard deviation (m, m, rad) of a smooth path
 _KEPT_SHARE = 0.9  # share of the first track's points that a restarted track must keep
-_GAPS_IN_LINE_M = (1.5, 4.0)  # least and greatest gap that is linked along the heading
+_GAPS_IN_LANE_M = (1.5, 4.0)  # least and greatest gap that is linked along the heading
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
 
@@ -72,7 +72,7 @@ class _Trial(NamedTuple):
     @property
     def leaves_much_unexplained(self) -> bool:
         """True if a motion without violations would be clearly more likely."""
-        return self.verdict.is_clearly_below(self.verdict.at_most)
+        return self.verdict.is_clearly_below(self.verdict.best_log_odds)
 
     def or_better(self, other_trial: _Trial) -> _Trial:
         """Return the other trial if it is clearly more likely, else this one."""
@@ -115,11 +115,12 @@ class _Search:
 
     def find_tracks(self) -> list[Track]:
         """Return the confirmed tracks; tracks from the best starting clusters come first."""
-        untried = self._all_obstacles()
+        is_untried = self._all_obstacles()
         for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
+            # Points of an earlier track, confirmed or rejected, start no other track.
             batch = self.batches[n]
-            is_open = batch.gather(self._free)[cluster] & batch.gather(untried)[cluster]
-            members = cluster[is_open]
+            is_available = batch.gather(self._free)[cluster] & batch.gather(is_untried)[cluster]
+            members = cluster[is_available]
             if len(members) < MIN_POINTS:
                 continue
             velocities = [
@@ -131,30 +132,30 @@ class _Search:
                 continue
             track, verdict = self._track_of(members, n, velocities)
             for j, rows in track.claimed.items():
-                untried[j][rows] = False
+                is_untried[j][rows] = False
             if verdict.moves:
-                self._keep(track)
+                self._confirm(track)
         return [track for track, _ in self._objects]
 
-    def _keep(self, track: Track) -> None:
-        """Keep a confirmed track, with all points that its motion explains."""
-        self._gather(track)
-        _refine(track, self._obstacles, self._ground)
-        self._claim_in_line(track)
+    def _confirm(self, track: Track) -> None:
+        """Add a confirmed track to the objects, with all points that its motion explains."""
+        self._claim_nearby(track)
+        _realign(track, self._obstacles, self._ground)
+        self._claim_in_lane(track)
         for j, rows in track.claimed.items():
             self._free[j][rows] = False
         self._objects.append(MovingObject(track, self._shape_of(track)))
 
     def _starting_velocities(self, members: Int, n: int) -> list[Float]:
         """Return velocities (3,), m/s, at which batch n's obstacles ``members`` may move."""
-        beside = velocities_beside(self.batches[n], members, self._objects)
-        return [self._velocity_of(members, n), *beside]
+        beside = find_nearby_velocities(self.batches[n], members, self._objects)
+        return [self._likely_velocity(members, n), *beside]
 
     def _shape_of(self, track: Track) -> Shape:
         """Return the shape of all points that a track has claimed."""
         return Shape.of(track.points_in(self._obstacles, sorted(track.claimed)))
 
-    def _velocity_of(self, members: Int, n: int) -> Float:
+    def _likely_velocity(self, members: Int, n: int) -> Float:
         """Return the likely velocity (3,), m/s, world, of ``members`` of batch n's obstacles."""
         batch = self.batches[n]
         if self._velocities_m_s is not None:
@@ -165,20 +166,20 @@ class _Search:
     def _may_move(self, members: Int, n: int, velocity: Float) -> bool:
         """Return True if other sweeps see less often through ``members`` once they are moved."""
         obstacles = self.batches[n].obstacles
-        rows = members[:: len(members) // NUM_ASKED + 1]
+        rows = members[:: len(members) // NUM_ASKED + 1]  # at most 60
         points = obstacles.points[rows]
         time_s = obstacles.time_s[rows]
         velocity_m_s = np.repeat([velocity, np.zeros(3)], len(rows), axis=0)
         num_moved = num_static = 0  # violations
         for m, batch in enumerate(self.batches):
             if m != n and self.clock.near(m, n, _NEAR_S):
-                j = batch.sweeps[0]
+                j = batch.sweeps[0]  # the first sweep stands for its batch
                 moved = points + (self._space.clock.time_s[j] - time_s)[:, None] * velocity
                 positions = np.concatenate([moved, points])
                 is_violated = self._space.seen_through(positions, j, velocity_m_s)
                 num_moved += int(is_violated[: len(rows)].sum())
                 num_static += int(is_violated[len(rows) :].sum())
-        # Without any evidence they may move.
+        # Points that no sweep saw through, moved or static, may move: nothing speaks against it.
         return num_moved < num_static or num_moved == num_static == 0
 
     def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> _Trial:
@@ -200,7 +201,7 @@ class _Search:
         for end in sorted({min(track.observations), max(track.observations)} - {n}):
             rows = track.rows_in(self.batches[end])
             if len(rows) >= MIN_POINTS:
-                restarted = self._follow(rows, end, self._velocity_of(rows, end))
+                restarted = self._follow(rows, end, self._likely_velocity(rows, end))
                 if restarted.track.total_points() >= _KEPT_SHARE * track.total_points():
                     best = best.or_better(restarted)
         return best
@@ -213,62 +214,64 @@ class _Search:
         verdict = judge(track, self._obstacles, self._space, self._objects, self._record)
         return _Trial(track, verdict)
 
-    def _gather(self, track: Track) -> None:
+    def _claim_nearby(self, track: Track) -> None:
         """Claim free candidates in or near the object that its motion explains, in place."""
-        # Otherwise these points would start a track of their own.
+        # Unclaimed points of the object would start a track of their own.
         shape = self._shape_of(track)
         for j, claimed in track.claimed.items():
             rows = self._unclaimed_around(track, shape, j, LINK_M)
             rows = rows[shape.near(track.in_object(self._obstacles[j], rows), FIT_M)]
-            track.claimed[j] = np.concatenate([claimed, self._without_violations(track, j, rows)])
+            track.claimed[j] = np.concatenate([claimed, self._drop_violations(track, j, rows)])
 
-    def _claim_in_line(self, track: Track) -> None:
+    def _claim_in_lane(self, track: Track) -> None:
         """Claim free clusters of single rings or columns ahead of and behind the object."""
-        # On a roof, or on a side that recedes from the scanner, they are too far apart to link.
-        # Tracked alone, the cluster would seem static, because the rays are static.
+        # On a roof, or on a side that recedes from the scanner, neighbouring rings or columns are
+        # too far apart to be linked. Such a cluster would seem static if it was tracked alone: the
+        # ray that hits the passing side stays where it is.
         space = self._space
         shape = self._shape_of(track)
         at_s = next(iter(track.observations.values())).seen_s
         lane = MovingObject(track, shape).lane(at_s)
-        rows_in_line = dict[int, Int]()  # by sweep index
-        # (N,3) points of the object, then those in line of each sweep, all at one time
+        rows_in_lane = dict[int, Int]()  # by sweep index
+        # (N,3) points of the object, then those of each sweep in the lane, all moved to one time
         clouds = [track.place(shape.points, at_s)]
         for j in track.claimed:
-            rows = self._rows_in_line(track, shape, j, lane, at_s)
-            rows_in_line[j] = rows
+            rows = self._rows_in_lane(track, shape, j, lane, at_s)
+            rows_in_lane[j] = rows
             clouds.append(track.place(track.in_object(self._obstacles[j], rows), at_s))
 
         T_lidar_world = space.T_lidar_world[next(iter(track.claimed))]
         columns_m = columns_apart_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
-        gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LINE_M))
-        # The points are compressed along the heading, until gaps up to ``gap_m`` are linked.
+        gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LANE_M))
+        # `link` joins points within `LINK_M`. Compressed along the heading by this ratio, points
+        # with gaps up to ``gap_m`` are linked too.
         points = np.concatenate(clouds)
         points[:, :2] -= (1 - LINK_M / gap_m) * (points[:, :2] @ lane.ahead)[:, None] * lane.ahead
         _, group = link(points, LINK_M)
         is_linked = np.isin(group, group[: len(shape.points)])
         ends = np.cumsum([len(cloud) for cloud in clouds])
-        linked_in_sweeps = np.split(is_linked, ends)[1:-1]  # the first part is the object itself
-        for (j, rows), linked in zip(rows_in_line.items(), linked_in_sweeps, strict=True):
+        is_linked_by_sweep = np.split(is_linked, ends)[1:-1]  # the first part is the object itself
+        for (j, rows), linked in zip(rows_in_lane.items(), is_linked_by_sweep, strict=True):
             track.claimed[j] = np.concatenate([track.claimed[j], rows[linked]])
 
-    def _rows_in_line(self, track: Track, shape: Shape, j: int, lane: Lane, at_s: float) -> Int:
-        """Return the rows of sweep j's free clusters of few rays in the lane of an object."""
+    def _rows_in_lane(self, track: Track, shape: Shape, j: int, lane: Lane, at_s: float) -> Int:
+        """Return the rows of sweep j's free clusters of a single ring or column in a lane."""
         obstacles = self._obstacles[j]
         rows = self._unclaimed_around(track, shape, j, LANE_M)
         T_lidar_world = self._space.T_lidar_world[j]
         rows = rows[_is_of_few_rays(obstacles, rows, T_lidar_world, self._space.sensors)]
         rows = rows[lane.holds(track.place(track.in_object(obstacles, rows), at_s))]
-        return self._without_violations(track, j, rows)
+        return self._drop_violations(track, j, rows)
 
-    def _unclaimed_around(self, track: Track, shape: Shape, j: int, room_m: float) -> Int:
-        """Return the rows of sweep j's free candidates up to ``room_m`` from an object's box."""
+    def _unclaimed_around(self, track: Track, shape: Shape, j: int, margin_m: float) -> Int:
+        """Return the rows of sweep j's free candidates within a margin of an object's box."""
         obstacles = self._obstacles[j]
         rim = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
-        rows = obstacles.strips.rows_inside(rim.min(0) - room_m, rim.max(0) + room_m)
+        rows = obstacles.strips.rows_inside(rim.min(0) - margin_m, rim.max(0) + margin_m)
         rows = rows[self._free[j][rows] & (obstacles.cluster[rows] >= 0)]
         return np.setdiff1d(rows, track.claimed[j], assume_unique=True)
 
-    def _without_violations(self, track: Track, j: int, rows: Int) -> Int:
+    def _drop_violations(self, track: Track, j: int, rows: Int) -> Int:
         """Return those ``rows`` of sweep j that, moved with the track, are never seen through."""
         for i in self._space.others(j):
             if self._space.clock.near(i, j, _NEAR_S) and len(rows):
@@ -283,12 +286,13 @@ def _is_of_few_rays(
     """Return (N,) True for ``rows`` whose cluster is hit by a single ring or column."""
     if not len(rows):
         return np.zeros(0, bool)
+    # All points of the clusters count, also those that are not in ``rows``.
     clusters, cluster_of_row = np.unique(obstacles.cluster[rows], return_inverse=True)
     members = np.flatnonzero(np.isin(obstacles.cluster, clusters))
     label = obstacles.cluster[members]
     in_lidar = poses.transform(T_lidar_world, obstacles.points[members])
 
-    def spread(values: Float) -> Float:
+    def spread(values: Float) -> Float:  # (K,) range of the values in each cluster
         lowest = ndimage.minimum(values, label, clusters)
         highest = ndimage.maximum(values, label, clusters)
         return np.asarray(highest) - np.asarray(lowest)
@@ -304,16 +308,17 @@ def _is_of_few_rays(
     return np.asarray(is_single[cluster_of_row.ravel()])
 
 
-def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
+def _realign(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
     """Align every observation again, in place; keep the result if the motion is smoother."""
     # Followed batch by batch, an object drifts when its other side comes into view. Therefore even
-    # batches are aligned with the points of the odd batches, and the other way round.
+    # batches are aligned with the points of the odd batches, and the other way round: points are
+    # never aligned with themselves.
     sweeps: tuple[list[int], list[int]] = [], []  # of the even batches, of the odd batches
     for n, observation in sorted(track.observations.items()):
         sweeps[n % 2].extend(observation.sweeps)
-    clouds = [track.points_in(obstacles, half) for half in sweeps]
+    clouds = [track.points_in(obstacles, parity_sweeps) for parity_sweeps in sweeps]
     if not all(map(len, clouds)):
-        return
+        return  # observed in batches of one parity only
     models = [Model(cloud) for cloud in clouds]
     previous_observations = dict(track.observations)
     previous_path = track.path
@@ -321,7 +326,7 @@ def _refine(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> 
         points = track.points_in(obstacles, observation.sweeps)
         target = track.place(points, observation.seen_s)
         predicted = track.path(observation.seen_s)
-        state = models[1 - n % 2].align(target, track.centre, predicted, _REFINED_STD)
+        state = models[1 - n % 2].align(target, track.centre, predicted, _PATH_STD)
         if state is not None:
             state[2] = track.rise_m(ground, state)
             track.observations[n] = replace(observation, state=state)
