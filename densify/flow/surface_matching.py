@@ -227,13 +227,13 @@ def _inform(surface: Float, row: int, information: Float) -> None:
             other += step
     covariance = np.zeros((3, 3))
     mean = np.zeros(3)
-    for k in near_row:
+    for near in near_row:
         for a in range(3):
-            mean[a] += surface[k, a] / len(near_row)
-    for k in near_row:
+            mean[a] += surface[near, a] / len(near_row)
+    for near in near_row:
         for a in range(3):
             for b in range(3):
-                product = (surface[k, a] - mean[a]) * (surface[k, b] - mean[b])
+                product = (surface[near, a] - mean[a]) * (surface[near, b] - mean[b])
                 covariance[a, b] += _LOOSE / len(near_row) * product
     # The ridge keeps the covariance invertible where all neighbours lie on a line or in a plane.
     ridge = _SURFACE_M**2 + _RIDGE / 3 * (covariance[0, 0] + covariance[1, 1] + covariance[2, 2])

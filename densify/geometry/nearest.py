@@ -231,9 +231,6 @@ def _touch(points: Float, start: Int, cell_a: int, cell_b: int, distance_m2: flo
 @inlined
 def _squared_m2(points: Float, i: int, j: int) -> float:
     """Return the squared distance between rows i and j of points (N,3)."""
-    dx, dy, dz = (
-        points[i, 0] - points[j, 0],
-        points[i, 1] - points[j, 1],
-        points[i, 2] - points[j, 2],
-    )
+    dx, dy = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]
+    dz = points[i, 2] - points[j, 2]
     return dx * dx + dy * dy + dz * dz
