@@ -52,12 +52,11 @@ def numbers(part_of: Callable[[np.ndarray], np.ndarray], *speeds_m_s: float) -> 
         path, wrong = track.path, copy(track)
         mid_s = (path.begin_s + path.end_s) / 2
         off = np.array([too_fast_m_s, 0, 0, 0])
-        # The coefficients of a straight line are its values at the means of their knots.
-        at_s = np.array([path.knots_s[i + 1 : i + 4].mean() for i in range(len(path.coefficients))])
+        # The coefficients of a straight line are its values, from one span before the path on.
+        num = len(path.coefficients)
+        at_s = path.begin_s + (path.end_s - path.begin_s) / (num - 3) * np.arange(-1, num - 1)
         coefficients = path.coefficients + (at_s - mid_s)[:, None] * off
-        wrong.path = type(path)(
-            path.knots_s, coefficients, path.begin_s, path.end_s, path.residual_m
-        )
+        wrong.path = type(path)(coefficients, path.begin_s, path.end_s, path.residual_m)
         tracks.append(wrong)
     return join_pieces(scene.stretch, tracks, pieces, space).number
 

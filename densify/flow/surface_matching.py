@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.nearest import nearest_k, tree_of
-from densify.geometry.types import Bool, Float, Int
+from densify.geometry.types import Bool, Float
 
 GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, per round
 # Greatest sum of the matches' weights: errors of neighbours on a surface are correlated.
@@ -22,6 +21,7 @@ _SURFACE_M = 0.05  # noise of a surface point
 _RIDGE = 0.02  # share of the mean variance that is added, for points on a line
 # Points of a model, and points that are aligned: more would be neighbours with the same error
 _MAX_MODEL_POINTS, _NUM_ALIGNED = 1000, 250
+_AXES = np.array([0, 1, 3])  # of a state: x, y and yaw
 # Factor of the covariance: points of a surface must not stop a motion along the surface.
 _LOOSE = 10.0
 
@@ -52,22 +52,6 @@ def _turned(arms: Float, yaw: float | Float) -> Float:
     return turned
 
 
-def surface_information(points: Float, rows: Int, loose: float = 1.0) -> Float:
-    """Return the (N,3,3) inverse covariances (1/m²) of a surface at N positions.
-
-    Args:
-        points: (M,3) points of the surface, metres.
-        rows: (N,k) rows of the neighbours that span the surface at each position.
-        loose: Factor of the covariance. Above 1 the surface constrains less.
-    """
-    offset = points[rows]
-    offset -= offset.mean(axis=1, keepdims=True)
-    covariance = loose / rows.shape[1] * (offset.transpose(0, 2, 1) @ offset)
-    # The ridge keeps the covariance invertible where all neighbours lie on a line or in a plane.
-    ridge = _SURFACE_M**2 + _RIDGE / 3 * np.trace(covariance, axis1=1, axis2=2)
-    return np.asarray(np.linalg.inv(covariance + ridge[:, None, None] * np.eye(3)))
-
-
 class Model:
     """Accumulated surface of an object, to which new points are aligned."""
 
@@ -81,8 +65,8 @@ class Model:
         points = points[np.argsort(points[:, 0], kind="stable")]
         # contiguous, or the kernels are compiled for both layouts
         self.points = np.ascontiguousarray(points[:: len(points) // _MAX_MODEL_POINTS + 1])
-        _, rows = nearest_k(tree_of(self.points), self.points, NUM_NEAR)
-        self.information = surface_information(self.points, rows, _LOOSE)
+        # (M,3,3) inverse covariances (1/m²) of the surface at the points, NaN until one is needed
+        self._information = np.full((len(self.points), 3, 3), np.nan)
 
     def covers(self, points: Float, within_m: float) -> Bool:
         """Return (N,) True for (N,3) points (object's frame) within ``within_m`` of the model."""
@@ -107,17 +91,8 @@ class Model:
         points = np.ascontiguousarray(points[:: max(1, len(points) // _NUM_ALIGNED)])
         state = predicted.copy()
         prior = prediction_std**-2
-        for gate_m in GATES_M:
-            H, g = np.zeros((3, 3)), np.zeros(3)  # normal equations H x = g of x, y and yaw
-            num = _add_matches(points, state, centre, self.points, self.information, gate_m, H, g)
-            if num < MIN_FIT:
-                return None
-            weight = min(1.0, MAX_WEIGHT / num)
-            # The prediction is one more measurement, with the inverse variances ``prior``.
-            H = weight * H + np.diag(prior)
-            g = weight * g + prior * (predicted - state)[[0, 1, 3]]
-            state[[0, 1, 3]] += np.linalg.solve(H, g)
-        return state
+        aligned = _align(points, centre, predicted, prior, self.points, self._information, state)
+        return state if aligned else None
 
 
 @inlined
@@ -125,7 +100,13 @@ def _nearest(point: Float, surface: Float, within_m: float) -> tuple[int, float]
     """Return the row in ``surface`` (M,3), ascending in x, and squared distance; -1 for none."""
     # The search starts at the point's x, and ends where x alone is farther than the nearest point.
     nearest_row, nearest_squared = -1, within_m**2
-    middle = np.searchsorted(surface[:, 0], point[0])
+    middle, end = 0, len(surface)
+    while middle < end:  # binary search; numpy's takes 0.5 s to compile
+        half = (middle + end) // 2
+        if surface[half, 0] < point[0]:
+            middle = half + 1
+        else:
+            end = half
     for step in (1, -1):
         row = middle if step > 0 else middle - 1
         while 0 <= row < len(surface):
@@ -149,49 +130,127 @@ def _are_near(points: Float, surface: Float, within_m: float, covered: Bool) -> 
 
 
 @Kernel
-def _add_matches(
+def _align(
     points: Float,  # (N,3) world
-    state: Float,
     centre: Float,
+    predicted: Float,
+    prior: Float,  # (3,) inverse variances of the predicted x, y and yaw
     surface: Float,  # (M,3) object's frame, ascending in x
-    information: Float,  # (M,3,3) of the surface
-    gate_m: float,  # greatest distance of a match
-    H: Float,
-    g: Float,
-) -> int:
-    """Add the normal equations of x, y and yaw to H (3,3) and g (3,); return how many match."""
-    J, JA = np.empty((2, 3, 3))  # J: derivative of the point by x, y and yaw, object's frame
-    J[:] = 0.0
-    J[0, 0] = J[1, 1] = np.cos(state[3])
-    J[0, 1] = np.sin(state[3])
-    J[1, 0] = -J[0, 1]
-    in_object, arm, from_centre, residual = np.empty((4, 3))
-    num = 0
-    for i in range(len(points)):
-        # The point in the object's frame, by the inverse of the state
+    information: Float,  # (M,3,3) of the surface, NaN where it is not known yet
+    state: Float,
+) -> bool:
+    """Fit ``state`` (4,), in place, to points, see `Model.align`; False for too few matches."""
+    J = np.zeros((3, 3))  # derivative of the point by x, y and yaw, object's frame
+    JA = np.empty((3, 3))
+    in_object, arm, from_centre, residual = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for gate_m in GATES_M:
+        J[0, 0] = J[1, 1] = np.cos(state[3])
+        J[0, 1] = np.sin(state[3])
+        J[1, 0] = -J[0, 1]
+        H, g = np.zeros((3, 3)), np.zeros(3)  # normal equations H x = g of x, y and yaw
+        num = 0
+        for i in range(len(points)):
+            # The point in the object's frame, by the inverse of the state
+            for a in range(3):
+                from_centre[a] = points[i, a] - centre[a] - state[a]
+            arm[0] = J[0, 0] * from_centre[0] + J[0, 1] * from_centre[1]
+            arm[1] = J[1, 0] * from_centre[0] + J[1, 1] * from_centre[1]
+            arm[2] = from_centre[2]
+            for a in range(3):
+                in_object[a] = arm[a] + centre[a]
+            row, squared = _nearest(in_object, surface, gate_m)
+            if row < 0:
+                continue
+            num += 1
+            # Gauss-Newton with Tukey's weight: H += w Jᵀ A J, g += w Jᵀ A residual. A motion of the
+            # object moves ``in_object`` by -J, hence g is the descent direction.
+            A = information[row]
+            if np.isnan(A[0, 0]):
+                _inform(surface, row, A)
+            weight = (1 - squared / gate_m**2) ** 2
+            J[0, 2] = -arm[1]
+            J[1, 2] = arm[0]
+            for a in range(3):
+                residual[a] = in_object[a] - surface[row, a]
+            for a in range(3):
+                for b in range(3):
+                    JA[a, b] = weight * (J[0, a] * A[0, b] + J[1, a] * A[1, b])
+                g[a] += JA[a, 0] * residual[0] + JA[a, 1] * residual[1] + JA[a, 2] * residual[2]
+                for b in range(3):
+                    H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
+        if num < MIN_FIT:
+            return False
+        weight = min(1.0, MAX_WEIGHT / num)
+        _step(H, g, weight, predicted, prior, state)
+    return True
+
+
+@inlined
+def _step(H: Float, g: Float, weight: float, predicted: Float, prior: Float, state: Float) -> None:
+    """Move ``state`` (4,), in place, by the solution of the weighted matches and the prediction."""
+    # The prediction is one more measurement, with the inverse variances ``prior``.
+    inverse = np.empty((3, 3))
+    for a in range(3):
+        for b in range(3):
+            H[a, b] *= weight
+        H[a, a] += prior[a]
+        g[a] = weight * g[a] + prior[a] * (predicted[_AXES[a]] - state[_AXES[a]])
+    _invert(H, inverse)
+    for a in range(3):
+        state[_AXES[a]] += inverse[a, 0] * g[0] + inverse[a, 1] * g[1] + inverse[a, 2] * g[2]
+
+
+@inlined
+def _inform(surface: Float, row: int, information: Float) -> None:
+    """Write the inverse covariance (3,3) of the surface (M,3), ascending in x, at one row."""
+    # The nearest points, the nearest first, searched as in `_nearest`
+    near_row = np.empty(min(NUM_NEAR, len(surface)), np.int64)
+    near_squared = np.empty(len(near_row))
+    for k in range(len(near_row)):
+        near_squared[k] = np.inf
+    for step in (1, -1):
+        other = row if step > 0 else row - 1
+        while 0 <= other < len(surface):
+            if (surface[other, 0] - surface[row, 0]) ** 2 >= near_squared[-1]:
+                break
+            squared = 0.0
+            for a in range(3):
+                squared += (surface[other, a] - surface[row, a]) ** 2
+            if squared < near_squared[-1]:
+                k = len(near_row) - 1
+                while k > 0 and near_squared[k - 1] > squared:
+                    near_row[k] = near_row[k - 1]
+                    near_squared[k] = near_squared[k - 1]
+                    k -= 1
+                near_row[k] = other
+                near_squared[k] = squared
+            other += step
+    covariance = np.zeros((3, 3))
+    mean = np.zeros(3)
+    for near in near_row:
         for a in range(3):
-            from_centre[a] = points[i, a] - centre[a] - state[a]
-        arm[0] = J[0, 0] * from_centre[0] + J[0, 1] * from_centre[1]
-        arm[1] = J[1, 0] * from_centre[0] + J[1, 1] * from_centre[1]
-        arm[2] = from_centre[2]
-        for a in range(3):
-            in_object[a] = arm[a] + centre[a]
-        row, squared = _nearest(in_object, surface, gate_m)
-        if row < 0:
-            continue
-        num += 1
-        # Gauss-Newton with Tukey's weight: H += w Jᵀ A J, g += w Jᵀ A residual. A motion of the
-        # object moves ``in_object`` by -J, hence g is the descent direction.
-        A = information[row]
-        weight = (1 - squared / gate_m**2) ** 2
-        J[0, 2] = -arm[1]
-        J[1, 2] = arm[0]
-        for a in range(3):
-            residual[a] = in_object[a] - surface[row, a]
+            mean[a] += surface[near, a] / len(near_row)
+    for near in near_row:
         for a in range(3):
             for b in range(3):
-                JA[a, b] = weight * (J[0, a] * A[0, b] + J[1, a] * A[1, b])
-            g[a] += JA[a, 0] * residual[0] + JA[a, 1] * residual[1] + JA[a, 2] * residual[2]
-            for b in range(3):
-                H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
-    return num
+                product = (surface[near, a] - mean[a]) * (surface[near, b] - mean[b])
+                covariance[a, b] += _LOOSE / len(near_row) * product
+    # The ridge keeps the covariance invertible where all neighbours lie on a line or in a plane.
+    ridge = _SURFACE_M**2 + _RIDGE / 3 * (covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
+    for a in range(3):
+        covariance[a, a] += ridge
+    _invert(covariance, information)
+
+
+@inlined
+def _invert(A: Float, inverse: Float) -> None:
+    """Write the inverse of a symmetric matrix A (3,3), by its cofactors."""
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        for d in range(3):
+            e, f = (d + 1) % 3, (d + 2) % 3
+            inverse[a, d] = A[b, e] * A[c, f] - A[b, f] * A[c, e]
+    determinant = A[0, 0] * inverse[0, 0] + A[0, 1] * inverse[0, 1] + A[0, 2] * inverse[0, 2]
+    for a in range(3):
+        for d in range(3):
+            inverse[a, d] /= determinant

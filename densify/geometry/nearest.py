@@ -146,51 +146,55 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
         least_share: Least share of seeds among the points around a dense seed.
     """
     is_close = np.zeros(len(points), bool)
-    seeds = points[seed]
-    if not len(seeds):
+    if not seed.any():
         return is_close
-    near_rows = np.flatnonzero(is_near(tree_of(seeds), points, within_m))
-    num_points, num_seeds = _count_around_seeds(points[near_rows], seed[near_rows], within_m)
-    dense_seeds = seeds[num_seeds >= least_share * num_points]
-    if len(dense_seeds):
-        is_close[near_rows] = is_near(tree_of(dense_seeds), points[near_rows], within_m)
-    return is_close
-
-
-def _count_around_seeds(points: Float, seed: Bool, within_m: float) -> tuple[Int, Int]:
-    """Return the (S,) numbers of points (N,3) and of seeds (N,) within a radius of each seed."""
+    low, high = points[seed].min(axis=0) - within_m, points[seed].max(axis=0) + within_m
+    rows = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     # Points are sorted by cells as large as the radius, numbered along z first: the cells around a
     # seed are nine ranges of points. A border of empty cells keeps columns apart.
-    cell = ((points - points.min(axis=0)) / within_m).astype(np.int64) + 1
+    cell = ((points[rows] - low) / within_m).astype(np.int64) + 1
     shape = cell.max(axis=0) + 2
     number = np.ravel_multi_index(tuple(cell.T), tuple(shape))
     order = np.argsort(number, kind="stable")
+    rows, number = rows[order], number[order]
     columns = shape[2] * np.array([x * shape[1] + y for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    column = number[seed][:, None] + columns
-    begin = np.searchsorted(number[order], column - 1)
-    end = np.searchsorted(number[order], column + 1, side="right")
-    num_points, num_seeds = np.zeros((2, len(column)), np.int64)
-    _count_in_ranges.over_rows(
-        len(column), points[order], seed[order], begin, end, points[seed], within_m**2,
-        num_points, num_seeds,
-    )  # fmt: skip
-    return num_points, num_seeds
+    column = number[seed[rows]][:, None] + columns
+    begin = np.searchsorted(number, column - 1)
+    end = np.searchsorted(number, column + 1, side="right")
+    is_close_in_order = np.zeros(len(rows), bool)
+    _mark_around_dense_seeds(
+        points[rows], seed[rows], begin, end, within_m**2, least_share, is_close_in_order
+    )
+    is_close[rows] = is_close_in_order
+    return is_close
 
 
 @Kernel
-def _count_in_ranges(
-    first: int, last: int, points: Float, seed: Bool, begin: Int, end: Int,
-    centre: Float, within_m2: float, num_points: Int, num_seeds: Int,
-) -> None:  # fmt: skip
-    """Count points and seeds within a radius of centres (S,3), in their ranges (S,9) of points."""
-    for i in range(first, last):
-        for j in range(begin.shape[1]):
-            for k in range(begin[i, j], end[i, j]):
-                dx, dy = points[k, 0] - centre[i, 0], points[k, 1] - centre[i, 1]
-                dz = points[k, 2] - centre[i, 2]
-                is_close = dx * dx + dy * dy + dz * dz <= within_m2
-                num_points[i] += is_close
-                num_seeds[i] += is_close & seed[k]
+def _mark_around_dense_seeds(
+    points: Float,
+    seed: Bool,
+    begin: Int,
+    end: Int,
+    within_m2: float,
+    least_share: float,
+    is_close: Bool,
+) -> None:
+    """Mark points (N,3) around dense seeds; seed s is compared with its ranges (S,9) of points."""
+    s = -1
+    for i in range(len(points)):
+        if not seed[i]:
+            continue
+        s += 1
+        num_points = num_seeds = 0
+        for r in range(begin.shape[1]):
+            for k in range(begin[s, r], end[s, r]):
+                is_around = _squared_m2(points, i, k) <= within_m2
+                num_points += is_around
+                num_seeds += is_around & seed[k]
+        if num_seeds >= least_share * num_points:
+            for r in range(begin.shape[1]):
+                for k in range(begin[s, r], end[s, r]):
+                    is_close[k] |= _squared_m2(points, i, k) < within_m2
 
 
 @Kernel
@@ -219,8 +223,14 @@ def _touch(points: Float, start: Int, cell_a: int, cell_b: int, distance_m2: flo
     """Return True if two points, one of each cell, are closer than the root of ``distance_m2``."""
     for i in range(start[cell_a], start[cell_a + 1]):
         for j in range(start[cell_b], start[cell_b + 1]):
-            dx, dy = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]
-            dz = points[i, 2] - points[j, 2]
-            if dx * dx + dy * dy + dz * dz < distance_m2:
+            if _squared_m2(points, i, j) < distance_m2:
                 return True
     return False
+
+
+@inlined
+def _squared_m2(points: Float, i: int, j: int) -> float:
+    """Return the squared distance between rows i and j of points (N,3)."""
+    dx, dy = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1]
+    dz = points[i, 2] - points[j, 2]
+    return dx * dx + dy * dy + dz * dz

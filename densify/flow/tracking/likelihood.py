@@ -264,13 +264,13 @@ def _returns_near(
     """Return the (N,3) obstacles within ``reach_m`` of positions (M,3), world, of no object."""
     rows = obstacles.strips.rows_inside(positions.min(0) - reach_m, positions.max(0) + reach_m)
     rows = rows[is_near(tree_of(positions), obstacles.points[rows], reach_m)]
+    points, time_s = obstacles.points[rows], obstacles.time_s[rows]
     for moving_object in objects:
-        points = obstacles.points[rows]
-        time_s = obstacles.time_s[rows]
-        if len(rows) and moving_object.may_be_near(points, time_s, LINK_M):
+        if len(points) and moving_object.may_be_near(points, time_s, LINK_M):
             in_object = moving_object.track.undo(points, time_s)
-            rows = rows[~moving_object.shape.near(in_object, LINK_M)]
-    return obstacles.points[rows]
+            is_other = ~moving_object.shape.near(in_object, LINK_M)
+            points, time_s = points[is_other], time_s[is_other]
+    return points
 
 
 @cache

@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import BSpline, PPoly
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from densify.flow.surface_matching import apply, undo
@@ -40,8 +39,8 @@ _CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-3, 0, 3, 0], [1, 4, 1, 0]]) 
 class Path:
     """A smooth motion: a cubic spline over time with d coordinates, first x and y in metres."""
 
-    knots_s: Float  # (n + 4,) knots of the n B-splines, s
-    coefficients: Float  # (n,d) of the B-splines; a `Track` has d = 4: x, y, z (m), yaw (rad)
+    # (n,d) of n B-splines on n - 3 equal spans of time; a `Track` has d = 4: x, y, z (m), yaw (rad)
+    coefficients: Float
     begin_s: float  # first time of the fit. The path continues at constant velocity before it.
     end_s: float  # last time of the fit. The path continues at constant velocity after it.
     # Root mean square distance of the states in x and y from the path, corrected for the degrees of
@@ -65,12 +64,12 @@ class Path:
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
         duration_s = end_s - begin_s
         num_spans = max(1, round(duration_s / _KNOT_S))
-        width_s = duration_s / num_spans
-        knots: Float = begin_s + width_s * np.arange(-_DEGREE, num_spans + _DEGREE + 1.0)
-        last_s = min(end_s, knots[-_DEGREE - 1])  # rounding may put the last knot before the end
-        # The splines are defined before the last knot only.
-        clipped_s = np.clip(times_s, begin_s, np.nextafter(last_s, begin_s))
-        B = BSpline.design_matrix(clipped_s, knots, _DEGREE).toarray()  # (m,n) values of n splines
+        # B: (m,n) values of n B-splines at the times. Four are above 0 in the span of a time.
+        at_span = (times_s - begin_s) * (num_spans / duration_s)
+        span = np.minimum(at_span.astype(np.int64), num_spans - 1)  # the end is in the last span
+        powers = (at_span - span)[:, None] ** np.arange(_DEGREE, -1, -1)
+        B = np.zeros((num_states, num_spans + _DEGREE))
+        np.put_along_axis(B, span[:, None] + np.arange(_DEGREE + 1), powers @ _CUBIC, axis=1)
         # D: differences of the coefficients, whose squares are penalised. Third differences are 0
         # at constant acceleration, second differences at constant velocity.
         may_accelerate = num_states >= MIN_STATES and duration_s >= MIN_SPAN_S
@@ -99,11 +98,11 @@ class Path:
                 residual_m = float(np.sqrt(mean_square * num_states / freedom))
                 least_error_m = error_m
                 coefficients = trial
-        return Path(knots, coefficients, begin_s, end_s, residual_m)
+        return Path(coefficients, begin_s, end_s, residual_m)
 
     @cached_property
-    def _pieces(self) -> PPoly:
-        """The path as polynomials in time; the first and the last piece are its ends' tangents."""
+    def _pieces(self) -> tuple[Float, Float]:
+        """Begins (P,) of the pieces, s, and their polynomials (4,P,d); the ends are tangents."""
         num_spans = len(self.coefficients) - _DEGREE
         width_s = (self.end_s - self.begin_s) / num_spans
         # Span k is a cubic polynomial of the coefficients k to k + 3.
@@ -121,16 +120,24 @@ class Path:
         # From units of a span to seconds
         powers = width_s ** -np.arange(_DEGREE, -1.0, -1)
         pieces = np.concatenate([first, cubic, last], axis=1) * powers[:, None, None]
-        return PPoly(pieces, self.begin_s + width_s * np.arange(-1.0, num_spans + 2))
+        return self.begin_s + width_s * np.arange(-1.0, num_spans + 1), pieces
+
+    def _piece_at(self, time_s: float | Float) -> tuple[Float, Float]:
+        """Return the polynomials (4,...,d) at times (...), and times (...,1) since they begin."""
+        begins_s, pieces = self._pieces
+        piece = begins_s[1:].searchsorted(time_s, side="right")
+        return pieces.take(piece, axis=1), np.asarray(time_s - begins_s[piece])[..., None]
 
     def __call__(self, time_s: float | Float) -> Float:
         """Return the states (..., d) at the given times (...) in seconds."""
-        state: Float = self._pieces(time_s)
+        (cubic, square, linear, constant), since_s = self._piece_at(time_s)
+        state: Float = ((cubic * since_s + square) * since_s + linear) * since_s + constant
         return state
 
     def rate(self, time_s: float | Float) -> Float:
         """Return the derivatives (..., d) of the states per second at the given times (...)."""
-        rate: Float = self._pieces(time_s, 1)
+        (cubic, square, linear, _), since_s = self._piece_at(time_s)
+        rate: Float = (3 * cubic * since_s + 2 * square) * since_s + linear
         return rate
 
     def travelled_m(self) -> float:

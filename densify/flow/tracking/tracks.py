@@ -259,8 +259,8 @@ class _Search:
         obstacles = self._obstacles[j]
         rows = self._unclaimed_around(track, shape, j, LANE_M)
         T_lidar_world = self._space.T_lidar_world[j]
-        rows = rows[_is_of_few_rays(obstacles, rows, T_lidar_world, self._space.sensors)]
         rows = rows[lane.holds(track.place(track.in_object(obstacles, rows), at_s))]
+        rows = rows[_is_of_few_rays(obstacles, rows, T_lidar_world, self._space.sensors)]
         return self._drop_violations(track, j, rows)
 
     def _unclaimed_around(self, track: Track, shape: Shape, j: int, margin_m: float) -> Int:
@@ -288,7 +288,9 @@ def _is_of_few_rays(
         return np.zeros(0, bool)
     # All points of the clusters count, also those that are not in ``rows``.
     clusters, cluster_of_row = np.unique(obstacles.cluster[rows], return_inverse=True)
-    members = np.flatnonzero(np.isin(obstacles.cluster, clusters))
+    is_asked = np.zeros(obstacles.num_clusters + 1, bool)  # the last one for cluster -1
+    is_asked[clusters] = True
+    members = np.flatnonzero(is_asked[obstacles.cluster])
     label = obstacles.cluster[members]
     in_lidar = poses.transform(T_lidar_world, obstacles.points[members])
 
