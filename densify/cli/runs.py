@@ -43,7 +43,7 @@ from densify.scores.depth_metrics import LEAST_PIXELS
 
 _FIRST_OF_RUN = {
     "report.html": "all of it, in a browser",
-    "figure.png": "what was gained, at a glance",
+    "figure.png": "the measured depth over the image",
     "depth_filled/*.png": "a depth map: 256 x metres",
     "depth_filled/*/*.png": "a depth map: 256 x metres",
     "cloud.laz": "the accumulated cloud",
@@ -186,8 +186,17 @@ def _summary(result: Result) -> str:
         lines.append(line)
         if expected := look_up(result.metrics, "expected_outliers", name):
             lines.append(
-                f"{name}, expected outliers by confidence: {percent(expected['measured'])} of the "
-                f"measured, {percent(expected['filled'])} of all pixels with a depth"
+                f"{name}, outliers expected by confidence: {percent(expected['measured'])} of the "
+                f"measured pixels, {percent(expected['filled'])} with filled ones"
+            )
+        found = [
+            look_up(result.metrics, "depth", name, product, "all", "outliers")
+            for product in ("measured", "filled")
+        ]
+        if None not in found:
+            lines.append(
+                f"{name}, outliers against exact truth: {percent(found[0])} of the measured pixels, "
+                f"{percent(found[1])} with filled ones"
             )
     if ghosts := _beside_icp(result, "ghosts", "all"):
         lines.append(f"ghosts of the accumulated points: {ghosts}")
