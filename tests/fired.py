@@ -35,10 +35,9 @@ def fired(
     since_s = time_s + pulses.offset_ns * 1e-9
     origin = sensor.origins_m[pulses.lidar]
     T_world_lidar = poses.exp(np.asarray(twist) * time_s)
+    offset_s = pulses.offset_ns * 1e-9
     start, ahead = (
-        poses.transform(
-            T_world_lidar, move_with_twists(points, pulses.offset_ns * 1e-9, twist, twist)
-        )
+        poses.transform(T_world_lidar, move_with_twists(points, offset_s, twist, twist))
         for points in (origin, origin + pulses.direction)
     )
     ray = ahead - start
