@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from densify.geometry.arrays import Float
 from densify.geometry.compiled import Kernel
 
 
 def move_with_twists(
-    points: Float, seconds: Float, twist_before: Float, twist_after: Float
+    points: Float, seconds: NDArray[np.floating], twist_before: Float, twist_after: Float
 ) -> Float:
     """Return the (N,3) points, each moved by ``exp(seconds * twist)``.
 
