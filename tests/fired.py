@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from densify.geometry import poses
+from densify.geometry.twists import move_with_twists
 from densify.geometry.types import RegisteredSweep, Sweep
 from densify.street.lidar import SENSORS, firings
 from tests.scenes import World
@@ -34,9 +35,9 @@ def fired(
     since_s = time_s + pulses.offset_ns * 1e-9
     origin = sensor.origins_m[pulses.lidar]
     T_world_lidar = poses.exp(np.asarray(twist) * time_s)
-    moved = np.asarray(twist) * pulses.offset_ns[:, None] * 1e-9  # since the reference time
+    offset_s = pulses.offset_ns * 1e-9
     start, ahead = (
-        poses.transform(T_world_lidar, poses.transform_each(moved, points))
+        poses.transform(T_world_lidar, move_with_twists(points, offset_s, twist, twist))
         for points in (origin, origin + pulses.direction)
     )
     ray = ahead - start

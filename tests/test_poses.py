@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from densify.geometry import poses
+from densify.geometry.twists import move_with_twists
 
 small = st.floats(-1e-6, 1e-6)
 any_size = st.floats(-1.7, 1.7)  # a rotation vector of at most 1.7 · sqrt(3) < pi
@@ -39,13 +40,15 @@ def test_rotation_is_the_matrix_exponential(twist):
     np.testing.assert_allclose(poses.exp(twist)[:3, :3], expm(skew), atol=1e-12)
 
 
-@given(st.lists(twists, min_size=1, max_size=8), st.integers(0, 1000))
-def test_transform_each_is_exp_of_every_point(each, seed):
-    points = np.random.default_rng(seed).normal(size=(len(each), 3)) * 50
+@given(twists, twists, st.lists(st.floats(-1, 1), min_size=1, max_size=8), st.integers(0, 1000))
+def test_move_with_twists_is_exp_of_every_point(before, after, seconds, seed):
+    points = np.random.default_rng(seed).normal(size=(len(seconds), 3)) * 50
     one_by_one = [
-        poses.transform(poses.exp(t), p[None])[0] for t, p in zip(each, points, strict=True)
+        poses.transform(poses.exp(s * (before if s < 0 else after)), p[None])[0]
+        for s, p in zip(seconds, points, strict=True)
     ]
-    np.testing.assert_allclose(poses.transform_each(np.array(each), points), one_by_one, atol=1e-9)
+    moved = move_with_twists(points, np.array(seconds), before, after)
+    np.testing.assert_allclose(moved, one_by_one, atol=1e-9)
 
 
 @given(twists, twists)

@@ -14,6 +14,7 @@ from densify.config import resolve
 from densify.depth.confidence import expected_outliers
 from densify.free_space.raw_sweeps import remove_lone_returns
 from densify.geometry import poses
+from densify.geometry.twists import move_with_twists
 from densify.outputs.key_outputs import write_result
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import run
@@ -83,7 +84,7 @@ def snowing(sweep):
 def compensated(sweep, twist, moment):
     """The sweep as a driver carries it to a moment of its own."""
     since_s = 1e-9 * (sweep.offset_ns - moment(sweep.offset_ns))
-    points = poses.transform_each(since_s[:, None] * twist, sweep.points)
+    points = move_with_twists(sweep.points, since_s, twist, twist)
     return replace(sweep, points=points)
 
 

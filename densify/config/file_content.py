@@ -45,9 +45,10 @@ def open_file(path: Path) -> BinaryIO:
 def read_bytes(path: Path, most_bytes: int = MOST_BYTES) -> bytes:
     """Return the content of a file; raise InputError if unreadable or over ``most_bytes``."""
     with open_file(path) as file:
-        check_size(os.fstat(file.fileno()).st_size, path, most_bytes)
+        num_bytes = os.fstat(file.fileno()).st_size
+        check_size(num_bytes, path, most_bytes)
         try:
-            return file.read(most_bytes)
+            return file.read(num_bytes)  # with a larger number Python reserves as much memory
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {reason(error)}") from error
 

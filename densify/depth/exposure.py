@@ -16,6 +16,7 @@ from densify.config import Config, ProjectSettings
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.cameras import NEAREST_M, depth_along, image_points, pixels_per_metre
+from densify.geometry.twists import move_with_twists
 from densify.geometry.types import (
     Bool,
     Camera,
@@ -233,14 +234,14 @@ class Exposure:
         last_pixel = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
         pixel_time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
         velocity_cam = poses.rotate(self.T_cam_key, velocity_m_s.astype(np.float64))
+        rotation = np.append(self.twist[:3], np.zeros(3))  # the twist without its translation
         for _ in range(_NUM_ROW_STEPS):
             pixel = np.where(np.isnan(uv), last_pixel / 2, np.clip(uv, 0, last_pixel))
             # The middle row is exposed at the time that the map shows.
-            row_s = ((pixel - last_pixel / 2) * pixel_time_s).sum(axis=1, keepdims=True)
+            row_s = ((pixel - last_pixel / 2) * pixel_time_s).sum(axis=1)
             # The camera moves by its twist, so the points move by its inverse in the camera frame.
-            rotation = np.hstack([-row_s * self.twist[:3], np.zeros((len(points), 3))])
-            translated = points_cam + row_s * (velocity_cam - self.twist[3:])
-            exposed_cam = poses.transform_each(rotation, translated)
+            translated = points_cam + row_s[:, None] * (velocity_cam - self.twist[3:])
+            exposed_cam = move_with_twists(translated, -row_s, rotation, rotation)
             uv, inside = image_points(self.camera, exposed_cam)
         return Sight(exposed_cam, uv, inside & (self.depth_m(exposed_cam) > NEAREST_M))
 

@@ -21,6 +21,7 @@ from densify.depth.patches import AGREE_M, HIDDEN_M
 from densify.free_space.ground import HeightMap
 from densify.geometry import poses
 from densify.geometry.arrays import joined_rows, select_rows
+from densify.geometry.twists import move_with_twists
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int, ObjectTrack, Stretch, Sweep
 
 _NEAR_M = 2.5 * AGREE_M  # distance within which a point of a body has other points of it
@@ -56,11 +57,8 @@ class Rays:
             if offset_ns is not None:
                 # From the reference time to the firing time the scanner moves with the lidar.
                 returns = _find_returns(registered.sweep, cloud.row[rows])
-                offset_s = offset_ns[returns, None] * 1e-9
-                twist: Float = np.where(
-                    offset_s < 0, registered.twist_before, registered.twist_after
-                )
-                origin = poses.transform_each(offset_s * twist, origin)
+                twists = registered.twist_before, registered.twist_after
+                origin = move_with_twists(origin, offset_ns[returns] * 1e-9, *twists)
             origins[rows] = poses.transform(self.stretch.T_target_source(self.key, frame), origin)
         return origins
 

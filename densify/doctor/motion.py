@@ -30,6 +30,7 @@ from densify.free_space.ground import HeightMap, find_upright
 from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.free_space.sensor import SensorModel, Sensors
 from densify.geometry import poses
+from densify.geometry.twists import move_with_twists
 from densify.geometry.types import Float, Sweep
 from densify.readers.recorded_poses import PoseTrack
 from densify.readers.timeline import format_frames, remove_unusable_returns
@@ -385,7 +386,7 @@ def _check_compensation(
     rings = rings_by_motion(points, offset_s, spot.twist, R, origins_m)
     if not rings.are_distinct:
         # The origin was searched in smeared rings. It is searched again in points as fired.
-        as_fired = poses.transform_each(-offset_s[:, None] * spot.twist, points) @ R.T
+        as_fired = move_with_twists(points, -offset_s, spot.twist, spot.twist) @ R.T
         rings = rings._replace(undone=sharpness(as_fired, find_origin(as_fired, origins_m[0])))
     text = (
         f"at {spot.speed_m_s:.1f} m/s the rings' sharpness is {rings.as_stored:.2f} as stored, "

@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from densify.geometry import poses
+from densify.geometry.compiled import Kernel
 from densify.geometry.nearest import bulk
 from densify.geometry.types import Bool, Float, Float32, Int, Stretch, Sweep
 
@@ -76,9 +77,15 @@ class HeightMap:
 
     def under(self, points: Float) -> Float:
         """Return (N,) ground heights, metres, at points (N,2 or 3); beyond the grid its edge's."""
-        # Heights are those of the middles of cells, half a cell from the corner.
-        x, y = ((points[:, axis] - self.low_m[axis]) / self.cell_m - 0.5 for axis in (0, 1))
-        ground_m: Float = ndimage.map_coordinates(self.heights_m, (x, y), order=1, mode="nearest")
+        ground_m = np.empty(len(points))
+        _interpolate.over_rows(
+            len(points),
+            np.ascontiguousarray(points, np.float64),
+            np.ascontiguousarray(self.heights_m, np.float64),
+            self.low_m,
+            self.cell_m,
+            ground_m,
+        )
         return ground_m
 
     def above(self, points: Float) -> Float32:
@@ -94,22 +101,47 @@ class HeightMap:
         return is_below
 
 
+@Kernel
+def _interpolate(begin, end, points, heights_m, low_m, cell_m, ground_m):  # type: ignore[no-untyped-def]
+    """Fill ``ground_m`` (N,) by bilinear interpolation between the middles of cells."""
+    num_x, num_y = heights_m.shape
+    for i in range(begin, end):
+        # In this order NaN becomes 0.
+        x = min(max(0.0, (points[i, 0] - low_m[0]) / cell_m - 0.5), num_x - 1.0)
+        y = min(max(0.0, (points[i, 1] - low_m[1]) / cell_m - 0.5), num_y - 1.0)
+        row, column = int(x), int(y)
+        next_row, next_column = min(row + 1, num_x - 1), min(column + 1, num_y - 1)
+        x, y = x - row, y - column
+        near_m = (1 - y) * heights_m[row, column] + y * heights_m[row, next_column]
+        far_m = (1 - y) * heights_m[next_row, column] + y * heights_m[next_row, next_column]
+        ground_m[i] = (1 - x) * near_m + x * far_m
+
+
 def _drop_far_points(clouds: Sequence[Float]) -> list[Float]:
     """Return the clouds (N,3) without the few points that are too far away for a grid."""
+    low_m, high_m = _bounds(clouds)
+    if np.prod((high_m - low_m) / CELL_M + 1) <= _MOST_CELLS:  # without a copy of all points
+        return list(clouds)
     in_grid = bulk(np.concatenate([points[:, :2] for points in clouds]), CELL_M, _MOST_CELLS)
     ends = np.cumsum([len(points) for points in clouds])[:-1]
     masks = np.split(in_grid, ends)
     return [points[mask] for points, mask in zip(clouds, masks, strict=True)]
 
 
-def _grid_around(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
-    """Return the (2,) lower corner of a grid around all points, and its numbers of cells."""
+def _bounds(clouds: Sequence[Float]) -> tuple[Float, Float]:
+    """Return the (2,) least and the (2,) greatest x and y of all points."""
     low_m = np.array(
         [min(points[:, axis].min(initial=np.inf) for points in clouds) for axis in (0, 1)]
     )
     high_m = np.array(
         [max(points[:, axis].max(initial=-np.inf) for points in clouds) for axis in (0, 1)]
     )
+    return low_m, high_m
+
+
+def _grid_around(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
+    """Return the (2,) lower corner of a grid around all points, and its numbers of cells."""
+    low_m, high_m = _bounds(clouds)
     low_m = np.floor(low_m / CELL_M) * CELL_M
     num_x, num_y = ((high_m - low_m) / CELL_M).astype(np.int64) + 1
     return low_m, (int(num_x), int(num_y))

@@ -22,6 +22,7 @@ _BLIND_DEG = (3, 90)  # wider gaps are the limits of a scanner's field of view
 
 _CELL_RAD, _CELL_DEPTH = np.radians(2.0), 0.08  # size of a cell; depth as a share of the range
 _USUAL_POINTS = 120_000  # a cell has some 50 rays of a sweep of so many points
+_BLOCK = 8192  # rows of a block
 _MIN_POINTS = 1000  # least number of points of a tested sweep
 _MAX_LONE = 5  # greatest number of returns in the cell of a lone return
 # Greatest share of returns single in their cell in good weather; real sweeps had up to 0.004
@@ -52,9 +53,13 @@ def _directions(points: Float) -> tuple[Float, Float, Float]:
 
 def _cell_numbers(coordinates: Float) -> Int:
     """Return the (N,) number of the unit cell that holds each of N coordinates (D,N)."""
-    cell = np.floor(coordinates).astype(np.int64)
-    cell -= cell.min(axis=1, keepdims=True)
-    return np.ravel_multi_index(tuple(cell), tuple(cell.max(axis=1) + 1))
+    number = np.zeros(coordinates.shape[1])  # whole numbers, exact up to 2^53
+    for axis_coordinates in coordinates:
+        cell = np.floor(axis_coordinates)
+        cell -= cell.min()
+        number *= cell.max() + 1
+        number += cell
+    return number.astype(np.int64)
 
 
 # --- snow, rain and dust
@@ -88,12 +93,20 @@ def remove_lone_returns(sweep: Sweep) -> Sweep:
 def _cell_coordinates(sweep: Sweep) -> Float:
     """Return the (4,N) scanner, azimuth, elevation and log range of the returns, in cells."""
     origins_m, lidar = sweep.scanner_origins, sweep.lidar
-    points = sweep.points if origins_m is None else sweep.points - origins_m[lidar]
-    azimuth, elevation, range_m = _directions(points)
     # The cells of a sparse scanner are larger: each cell has about as many rays.
-    per_rad = (np.sqrt(np.bincount(lidar) / _USUAL_POINTS) / _CELL_RAD)[lidar]
-    depth = np.log(np.maximum(range_m, 1e-3)) / _CELL_DEPTH
-    return np.stack([lidar, azimuth * per_rad, elevation * per_rad, depth])
+    per_rad = np.sqrt(np.bincount(lidar) / _USUAL_POINTS) / _CELL_RAD
+    coordinates = np.empty((4, len(sweep)))
+    coordinates[0] = lidar
+    # Blocks of rows whose many intermediate results stay in the processor's cache
+    for first in range(0, len(sweep), _BLOCK):
+        rows = slice(first, first + _BLOCK)
+        points = sweep.points[rows]
+        if origins_m is not None:
+            points = points - origins_m[lidar[rows]]
+        azimuth, elevation, range_m = _directions(points)
+        coordinates[1:3, rows] = per_rad[lidar[rows]] * [azimuth, elevation]
+        coordinates[3, rows] = np.log(np.maximum(range_m, 1e-3)) / _CELL_DEPTH
+    return coordinates
 
 
 def _count_in_cells(coordinates: Float) -> Int:

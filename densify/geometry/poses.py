@@ -77,13 +77,6 @@ def transform_twist(T_a_b: Float, twist_b: Float) -> Float:
     return np.concatenate([rotation, translation + lever], axis=-1)
 
 
-def transform_each(twist: Float, points: Float) -> Float:
-    """Return the (N,3) points after moving each point by ``exp`` of its own twist (N,6)."""
-    moved: Float = Rotation.from_rotvec(twist[:, :3]).apply(points)
-    moved += twist[:, 3:]
-    return moved
-
-
 def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:
     """Return the (4,4) pose between a (fraction 0) and b (fraction 1), or beyond."""
     return T_world_a @ exp(fraction * log(inverse(T_world_a) @ T_world_b))

@@ -20,6 +20,7 @@ from densify.outputs.atomic import write_file
 from densify.readers.decoded_files import read_las
 
 _SCALE_M = 0.001
+_ONE_RETURN = 0x11  # bits of a pulse's only return: its number and the number of returns
 _MOST_LEVEL = 65535  # of the 16 bits of intensity and colours
 _TO_16_BITS = 257  # 255 becomes 65535
 _UNIX_DAY_0, _DAY_NS = datetime.date(1970, 1, 1), 86400 * 10**9
@@ -131,20 +132,27 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
         [laspy.ExtraBytesParams(name, kind, text) for name, kind, text in _EXTRA_DIMENSIONS]
     )
     las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header))
-    las.xyz = cloud.points
-    las.gps_time = (stamp_ns - _LAS_EPOCH_NS + cloud.since_key_ns) * 1e-9
-    las.intensity = np.rint(_MOST_LEVEL * np.clip(cloud.intensity, 0, 1)).astype(np.uint16)
-    las.red, las.green, las.blue = (cloud.rgb.astype(np.uint16) * _TO_16_BITS).T
-    las.return_number = np.ones(len(cloud), np.uint8)
-    las.number_of_returns = np.ones(len(cloud), np.uint8)
-    for axis, name in enumerate(_DISPLACED):
-        las[name] = (cloud.points[:, axis] - cloud.rigid_points[:, axis]).astype(np.float32)
-    for name, kind, _ in _EXTRA_DIMENSIONS:
-        if name not in _DISPLACED:
-            las[name] = getattr(cloud, name).astype(kind)
+    _fill_record(las.points.array, cloud, stamp_ns)
     buffer = io.BytesIO()
     las.write(buffer, do_compress=True)
     write_file(path, buffer.getvalue())
+
+
+def _fill_record(record: NDArray[Any], cloud: Cloud, stamp_ns: int) -> None:
+    """Fill a structured array of point format 7 with the points of a cloud."""
+    # Columns of the plain array: those of laspy are several times slower.
+    for axis, name in enumerate("XYZ"):
+        record[name] = np.rint(cloud.points[:, axis] / _SCALE_M)
+    record["gps_time"] = (stamp_ns - _LAS_EPOCH_NS + cloud.since_key_ns) * 1e-9
+    record["intensity"] = np.rint(_MOST_LEVEL * np.clip(cloud.intensity, 0, 1))
+    for channel, name in enumerate(_COLOURS):
+        record[name] = cloud.rgb[:, channel].astype(np.uint16) * _TO_16_BITS
+    record["bit_fields"] = _ONE_RETURN
+    for axis, name in enumerate(_DISPLACED):
+        record[name] = cloud.points[:, axis] - cloud.rigid_points[:, axis]
+    for name, _, _ in _EXTRA_DIMENSIONS:
+        if name not in _DISPLACED:
+            record[name] = getattr(cloud, name)
 
 
 def read_cloud(path: Path) -> StoredCloud:

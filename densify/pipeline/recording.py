@@ -274,10 +274,11 @@ class Recording:
         """
         stretch = self.window(key)
         used = stretch if all_sweeps else Stretch((stretch[key],))
-        fields = [FlowField.zero(len(registered.sweep)) for registered in used.sweeps]
         flow = None
         tracks: tuple[ObjectTrack, ...] = ()
-        if engine is not None:
+        if engine is None:
+            fields = [FlowField.zero(len(registered.sweep)) for registered in used.sweeps]
+        else:
             with self._watch.stage("flow"):
                 motion = self.motion(key, engine)
                 frames = self._watch.each("flow", stretch.frames)
@@ -288,6 +289,7 @@ class Recording:
         with self._watch.stage("accumulate"):
             drop_lost = self.settings.accumulate.unfollowed == "drop"
             cloud = accumulate(used, fields, key, drop_lost)
+            del fields  # as large as the cloud
             heights = self._ground(self._piece(key))
             tracks = complete_boxes(tracks, cloud, Rays(used, key), heights)
             is_below = heights.below(cloud.rigid_points, stretch[key].T_world_lidar)

@@ -220,6 +220,7 @@ def densify(
             recording.sweeps.read.cache_clear()
         cloud = moments[methods[-1]].cloud
         scene = scene_of(recording, key, shots, images, far_surfaces, cloud, with_images, watch)
+        del cloud  # its method replaces it, and must not hold both
         are_filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene, moments)
         results_alone = list(pool.map(make, methods, are_filled))

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.geometry import poses
+from densify.geometry.twists import move_with_twists
 from densify.geometry.types import Float, Int, RegisteredSweep, Stretch, Sweep, Trajectory
 
 
@@ -46,9 +47,7 @@ def deskew_sweep(
     """
     points: Float = sweep.points
     if sweep.offset_ns is not None:
-        offset_s = sweep.offset_ns[:, None] * 1e-9
-        twist = np.where(offset_s < 0, twist_before, twist_after)
-        points = poses.transform_each(np.asarray(offset_s * twist, np.float64), points)
+        points = move_with_twists(points, sweep.offset_ns * 1e-9, twist_before, twist_after)
     deskewed = replace(sweep, points=points)
     return RegisteredSweep(deskewed, T_world_lidar, twist_before, twist_after)
 
@@ -150,7 +149,7 @@ def rings_by_motion(
         return max(sharpness(moved @ R.T, origin_m) for origin_m in origins_m)
 
     def move(since_s: Float) -> Float:
-        return poses.transform_each(since_s[:, None] * twist, points)
+        return move_with_twists(points, since_s, twist, twist)
 
     # It is unknown to which time within the sweep the points were compensated.
     moments_s = {
