@@ -187,6 +187,9 @@ def find_candidates(
     because usually only a part of a moving object's points is seen through.
 
     Args:
+        stretch: Consecutive registered sweeps.
+        space: Free space that the sweeps observed.
+        ground: Height of the ground in the world frame.
         among: Indices of the sweeps to return, None for all.
     """
 
@@ -210,13 +213,13 @@ def find_candidates(
 
 
 def compress_heights(points: Float, gap_m: Float) -> Float:
-    """Return the (N,3) points, with heights compressed until rings are at most 0.35 m apart.
+    """Return the (N,3) points, with heights compressed where rings are over 0.35 m apart.
 
     Otherwise the rings of an object would be too far apart to be linked.
 
     Args:
         points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
-        gap_m: (N,) distance between neighbouring rings at each point.
+        gap_m: (N,) distance between neighbouring rings at each point, metres.
     """
     compressed = points.copy()
     compressed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
@@ -232,16 +235,17 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Link seeds and points within 0.4 m of seeds into clusters.
+    """Return the number of clusters of seeds and points close to seeds, and the (N,) clusters.
 
-    Seeds with a share of other seeds below 0.4 around them, as in a hedge, do not count.
+    Points within 0.4 m of a seed are candidates. A seed with a share of seeds below 0.4 around it,
+    as in a hedge, does not count. Candidates linked by steps of up to 0.6 m are one cluster.
 
     Args:
         points: (N,3) metres.
         seed: (N,) True for seeds.
 
     Returns:
-        The number of clusters, and (N,) labels, -1 for points in no cluster.
+        The number of clusters, and (N,) labels from 0, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
     rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))

@@ -281,10 +281,6 @@ class Track:
         """Return the number of the object's points in all sweeps."""
         return sum(map(len, self.claimed.values()))
 
-    def duration_s(self) -> float:
-        """Return the time between the first and the last observation."""
-        return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
-
     def rise_m(self, ground: HeightMap, state: Float) -> float:
         """Return how much (m) the ground rises from the first position to that of a state (4,)."""
         # The median over three lines along the motion, in the middle and 1 m to both sides: the
@@ -335,7 +331,7 @@ class Shape:
         return inside
 
     def near(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for points (N,3, object's frame) ``within_m`` of it or in its outline."""
+        """Return (N,) True for points (N,3, object's frame) within ``within_m`` or the outline."""
         return is_near(self.tree, points, within_m) | self.within_outline(points)
 
     @cached_property
