@@ -41,10 +41,11 @@ _AGREES = 2.0  # tolerance, as a multiple of that between two static points of a
 def close_bodies(
     record: MapRecord, cloud: Cloud, exposure: Exposure, bodies: Mapping[int, MovingBody]
 ) -> None:
-    """Put the surfaces of moving bodies into the record; ``on_body`` marks their pixels.
+    """Put the surfaces of moving bodies into the record, in place; ``on_body`` marks their pixels.
 
     Depths clearly in front stay. Elsewhere inside the outline of a hull only depths of moving
-    objects stay. Pixels with a return of the body on its surface count as measured.
+    objects stay. Pixels with a return of the body on its surface count as measured. ``bodies`` are
+    by instance number.
     """
     margin_px = round(VOTERS_REACH * float(np.median(record.gap_px)))
     for instance, body in bodies.items():
@@ -219,12 +220,17 @@ def _show(
     surface_m = (1 / surface).astype(np.float32)
     is_compact = (share[inside] >= _LEAST_OF_OTHER).mean() >= _COMPACT
 
-    # The core is well inside the closed part. It shows the body, unless something is in front.
+    # The core, well inside the closed part, shows the body, unless something is in front.
     is_hidden = (record.filled_m > 0) & (record.filled_m < surface_m - hidden_m(surface_m))
     is_closed = share >= (_LEAST_OF_COMPACT if is_compact else _LEAST_OF_OTHER)
     core = _erode(is_closed, float(np.median(record.gap_px[inside]))) & ~is_hidden
+    record.filled_m[core] = surface_m[core]
+    record.votes[core] = 1
+    slope_down, slope_right = np.gradient(surface)
+    record.tilt[core] = np.stack([slope_right, slope_down], axis=-1)[core]
 
-    # In the outline only depths of moving objects in front of the surface, or on it, stay.
+    # The outline is the rest of the front: it may show the body or what is behind. It loses all
+    # depths but those of moving objects in front of the surface, or on it.
     is_moving = (record.depth_m > 0) & cloud.moving[record.point]
     stays = is_moving & (record.depth_m <= surface_m + allowed_m)
     outline = inside & ~is_hidden & ~core & ~stays
@@ -233,12 +239,7 @@ def _show(
     for layer_m in (record.depth_m, record.filled_m, record.rejected_m):
         layer_m[outline] = 0  # a background seen past a moving object is not given back
 
-    record.filled_m[core] = surface_m[core]
-    record.votes[core] = 1
-    slope_down, slope_right = np.gradient(surface)
-    record.tilt[core] = np.stack([slope_right, slope_down], axis=-1)[core]
-
-    # The votes decide the silhouette.
+    # The votes of the pixels around decide where in the outline the silhouette is.
     pixel = np.flatnonzero(outline)
     votes = votes_for(
         record, [record.filled_m], pixel, surface_m[outline], with_shifts=not is_compact

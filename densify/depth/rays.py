@@ -305,7 +305,10 @@ def _body(
 def complete_boxes(
     tracks: Sequence[ObjectTrack], cloud: Cloud, rays: Rays, ground: HeightMap
 ) -> tuple[ObjectTrack, ...]:
-    """Return the tracks with completed boxes, and with the sides that were seen.
+    """Return the tracks with completed boxes, and in ``sides_seen`` the sides that were seen.
+
+    Where no ray shows free space a box grows to the usual size of a vehicle, and to the ground. A
+    side is seen if free space begins within 0.4 m of it. The bottom is never named.
 
     Args:
         tracks: The tracked objects, with boxes around their points.
@@ -378,7 +381,8 @@ def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectT
     for axis, sides in enumerate(_SIDES):
         # At the lower and at the upper end of the axis. The rays are in the frame of the first box.
         free_m = [
-            _free_m(track.size_m, missing_m, axis, sign, start, to_return) for sign in (-1, 1)
+            _distance_to_free_space_m(track.size_m, missing_m, axis, sign, start, to_return)
+            for sign in (-1, 1)
         ]
         is_seen = [end_m <= _BESIDE_M for end_m in free_m]
         sides_seen += [side for side, seen in zip(sides, is_seen, strict=True) if seen]
@@ -399,7 +403,7 @@ def _share_growth(missing_m: float, room_m: Sequence[float]) -> list[float]:
     return [min(end_m, part + rest_m) for end_m, part in zip(room_m, part_m, strict=True)]
 
 
-def _free_m(
+def _distance_to_free_space_m(
     size_m: Float, missing_m: Float, axis: int, sign: int, start: Float, to_return: Float
 ) -> float:
     """Return the metres from a side of a box to the nearest free space outside; inf for none.
@@ -407,7 +411,8 @@ def _free_m(
     The side is at the lower (``sign`` -1) or upper (1) end of ``axis``. Free space is where three
     rays (K,3), in the frame of the box, pass. It is looked for up to where the box may grow.
     """
-    # The space outside the flat part of the side; vertical sides are tested below the windows.
+    # The searched space, from low to high: from the side outwards, and beside its flat part only;
+    # vertical sides are tested below the windows.
     low, high = -_MIDDLE * size_m / 2, _MIDDLE * size_m / 2
     if axis < 2:
         low[2], high[2] = -size_m[2] / 2 + np.array(_BODY) * size_m[2]
@@ -415,14 +420,15 @@ def _free_m(
     side_m = sign * size_m[axis] / 2
     low[axis], high[axis] = sorted([side_m, side_m + sign * reach_m])
 
-    # Each ray crosses the space from its origin or entry to its return or exit.
+    # Each ray crosses the space from its origin (0) or entry to its return (1) or exit.
     enter, leave = find_crossing(_box_spaces(low, high), start, to_return)
     enter, leave = np.maximum(enter, 0), np.minimum(leave, 1)
     crosses = enter < leave
     start_m, ray_m = start[crosses, axis], to_return[crosses, axis]
     ends_m = np.stack([start_m + enter[crosses] * ray_m, start_m + leave[crosses] * ray_m])
-    distance_m = np.sort(np.min(sign * ends_m, axis=0) - abs(side_m))  # of each ray's nearer end
-    return float(distance_m[_NUM_RAYS - 1]) if len(distance_m) >= _NUM_RAYS else np.inf
+    # A ray shows free space from the end of this part that is nearer to the side.
+    nearer_m = np.sort(np.min(sign * ends_m, axis=0) - abs(side_m))
+    return float(nearer_m[_NUM_RAYS - 1]) if len(nearer_m) >= _NUM_RAYS else np.inf
 
 
 def _box_spaces(low: Float, high: Float) -> Float:

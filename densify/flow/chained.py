@@ -38,10 +38,7 @@ class ChainedMotion:
         lost if its object has no points in the next sweep, or, without an object, if the nearest
         such point is more than 0.5 m away.
 
-        Args:
-            frame: Frame number of a sweep in the stretch.
-            target: Frame number of a sweep in the stretch. The flow to ``frame`` itself is 0, with
-                the labels of the step to a neighbouring sweep.
+        The flow to ``frame`` itself is 0, with the labels of the step to a neighbouring sweep.
         """
         i = self.stretch.frames.index(frame)
         j = self.stretch.frames.index(target)

@@ -46,10 +46,7 @@ class SharedMotion(Motion, Protocol):
     # A dataclass, which the disk cache stores without the points of its sweeps
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
-        """Return the same motion on another copy of its stretch.
-
-        The disk cache stores the motion on a copy without points, and replaces it after loading.
-        """
+        """Return the same motion on another copy of its stretch; that on disk has no points."""
         ...
 
 

@@ -229,11 +229,7 @@ def _descending_alphas(first: float, alpha: float) -> list[float]:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion by the published objective, chained between neighbouring sweeps.
-
-    Each step is solved when its flow is first asked for. Points less than 0.2 m above the ground
-    have flow 0. The section ``objective`` of the settings is used; ``argument`` is not.
-    """
+    """Return the motion by the published objective, above the ground; no ``argument`` is used."""
 
     def step(i: int, j: int) -> FlowField:
         return _sweep_flow(scene, i, j, settings)
@@ -268,9 +264,8 @@ def flow_between(
     Args:
         source: (N,3) metres.
         target: (M,3) metres, in the same frame.
-        settings: Solver, alpha and number of neighbours. With ``static_prior`` only groups of
-            points that certainly move have flow, and are numbered from 0 as instances. Without it
-            every point counts as moving, as the instance -1.
+        settings: Settings of the solver. With ``static_prior`` only groups of points that certainly
+            move have flow, each as an instance. Without it every point moves, as instance -1.
         initial: (N,3) flow to start from, metres; None starts from 0.
 
     Raises:

@@ -83,10 +83,7 @@ class Surface:
         self._points, self._tree = points, tree_of(points)
 
     def cost(self, points: Float) -> Float:
-        """Return (N,) costs of points (N,3): half their squared Mahalanobis distances, at most 3.
-
-        The nearest 12 surface points within 1 m give the distribution; below three the cost is 3.
-        """
+        """Return (N,) costs of points (N,3), 0 to 3: half their squared Mahalanobis distances."""
         cost = np.full(len(points), MISSING)
         num = min(NUM_NEAR, self._tree.n)
         if num < _MIN_NEIGHBORS:
@@ -99,11 +96,10 @@ class Surface:
         neighbour = np.where(exists, np.asarray(neighbour)[on_surface], 0)
         # Normal distribution of the neighbours that exist; others have weight 0
         weight = exists / exists.sum(axis=1, keepdims=True)
-        spread = self._points[neighbour]  # (N,k,3)
-        mean = np.einsum("nk,nki->ni", weight, spread)
-        spread -= mean[:, None]
-        covariance = spread.transpose(0, 2, 1) @ (weight[..., None] * spread)
-        covariance = covariance + _NOISE_M**2 * np.eye(3)
+        arms = self._points[neighbour]
+        mean = np.einsum("nk,nki->ni", weight, arms)
+        arms -= mean[:, None]
+        covariance = arms.transpose(0, 2, 1) @ (weight[..., None] * arms) + _NOISE_M**2 * np.eye(3)
         offset = points[on_surface] - mean
         scaled_offset = np.linalg.solve(covariance, offset[..., None])[..., 0]
         squared = np.einsum("ni,ni->n", offset, scaled_offset)
@@ -116,10 +112,7 @@ _MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and h
 
 
 def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
-    """Return (N,) True for points of a cloud without a counterpart in the other cloud.
-
-    A counterpart is a point within 0.1 m, or a surface of `Surface` at a cost of at most 1.5.
-    """
+    """Return (N,) True for points without a counterpart: no other surface or point in 0.1 m."""
     unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _NOISE_M))
     surface = Surface(other_cloud.points[other_cloud.thin(np.arange(len(other_cloud.points)))])
     unexplained = np.zeros(len(cloud.points), bool)
@@ -156,7 +149,7 @@ def find_road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[In
     """Return the ascending rows of each group that may be a road user, not a treetop or a wall.
 
     Such a group has at least 8 points, 5 of them unexplained. Its lowest points (5th percentile)
-    are at most 3.4 m above the ground, its highest points (95th percentile) at most 6 m.
+    are at most 3.4 m high, its highest points (95th percentile) at most 6 m.
 
     Args:
         group: (N,) label of each point's group, -1 for none.
@@ -267,8 +260,6 @@ def judge(
         group: Index of the group, which the proposal keeps.
         members: (K,) rows of the group's source points, K >= 1.
         motion: Motion of the group that is judged.
-        source: The cloud before the motion.
-        target: The cloud after the motion, at least one point.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.thin(members)
@@ -301,10 +292,7 @@ def cost_on_target(
     motion.
 
     Args:
-        source: The cloud before the motion.
         members: (K,) rows of the compared source points, K >= 1.
-        target: The cloud after the motion, at least one point.
-        motion: Motion of the source points.
 
     Returns:
         cost: (K,) costs of the source points, 0 to 3, see `Surface.cost`.
@@ -314,10 +302,9 @@ def cost_on_target(
     members_at_start = motion.at_start(source, members)
     # Target points are measured over some time. Only those can fit that lie around the group at the
     # first or at the last of these times.
-    at_first, at_last = (
-        motion.place(members_at_start, share) for share in (target.share.min(), target.share.max())
-    )
-    rows = target.rows_around(np.concatenate([at_first, at_last]))
+    ends = target.share.min(), target.share.max()
+    positions = [motion.place(members_at_start, share) for share in ends]
+    rows = target.rows_around(np.concatenate(positions))
     target_at_start = motion.at_start(target, rows)
     is_close = _in_box(target_at_start, members_at_start, SURFACE_M)
     return Surface(target_at_start[is_close]).cost(members_at_start), rows[is_close]
@@ -352,7 +339,6 @@ class Search:
         if self.initial is not None:
             initial_m = np.median(self.initial[members], axis=0)
             displacements.append(initial_m)
-            # The initial flow may exceed the reach of the vote.
             limit_m = max(reach_m, float(np.linalg.norm(initial_m)) + _APART_M)
         room_m = np.array([limit_m, limit_m, 0.0]) + LINK_M
         rows = self.target.strips.rows_inside(points.min(0) - room_m, points.max(0) + room_m)

@@ -38,13 +38,7 @@ def apply(state: Float, points: Float, centre: Float) -> Float:
 
 
 def undo(state: Float, points: Float, centre: Float) -> Float:
-    """Return the (N,3) points turned and moved back, the inverse of `apply`.
-
-    Args:
-        state: Displacement x, y, z (m) and yaw (rad) that is undone: (4,) or (N,4).
-        points: (N,3) metres, as `apply` returns them.
-        centre: Centre of the rotation before the displacement: (3,) or (N,3).
-    """
+    """Return the (N,3) points before `apply` moved them by this state about this centre."""
     return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
 
 
@@ -87,8 +81,7 @@ class Model:
         """Return the state (4,) that fits the model to the points, None for fewer than 5 matches.
 
         Displacement x, y and yaw are solved with Tukey weights. The height z stays as predicted: on
-        an object hit by few beams it would follow the beams. Of more than 500 points every second,
-        third ... is used, 250 to 375 in all.
+        an object hit by few beams it would follow the beams. Of many points some 250 are used.
 
         Args:
             points: (N,3) world, metres, all at one time.
@@ -153,8 +146,7 @@ def _align(
     # weight w of each match the step solves H x = g: H = Σ w Jᵀ A J, g = Σ w Jᵀ A residual.
     J = np.zeros((3, 3))  # rows: x, y, z of the point; columns: x, y, yaw; the row of z stays 0
     JA = np.empty((3, 3))  # w Jᵀ A
-    from_centre, turned = np.empty(3), np.empty(3)
-    in_object, residual = np.empty(3), np.empty(3)
+    from_centre, turned, in_object, residual = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for gate_m in GATES_M:
         # The first two columns of J are the rotation from the world to the object's frame.
         J[0, 0] = J[1, 1] = np.cos(state[3])

@@ -50,8 +50,7 @@ def estimate_flow(
     Args:
         source: (N,3) metres, z up, with or without the ground.
         target: (M,3) metres, as ``source``.
-        config: A `Config`, its values by section and name, or the path of a file. None takes the
-            defaults. ``flow.engine`` and the section ``objective`` are used.
+        config: Settings, None for the defaults; ``flow.engine`` and ``objective`` are used.
         initial: (N,3) flow to start from. It is needed only for objects faster than the search
             covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
         source_offset_ns: (N,) times of the points. Both clouds use one clock, or each counts from
@@ -217,11 +216,7 @@ def _times_as_shares(times_ns: tuple[Int, Int] | None) -> _PointTimes | None:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion of the engine ``pairs``: `estimate_flow` of neighbouring sweeps, chained.
-
-    Each step is computed when its flow is first asked for. The section ``objective`` of the
-    settings is used; ``argument`` is not.
-    """
+    """Return the chained `estimate_flow` of neighbouring sweeps, for recordings of two sweeps."""
     # The engine ``groups`` is the default of `estimate_flow`, which does not know ``pairs``.
     pair_settings = replace(settings, flow=replace(settings.flow, engine="groups"))
 

@@ -187,9 +187,6 @@ def find_candidates(
     because usually only a part of a moving object's points is seen through.
 
     Args:
-        stretch: Consecutive registered sweeps.
-        space: Free space that the sweeps observed.
-        ground: Height of the ground in the world frame.
         among: Indices of the sweeps to return, None for all.
     """
 
@@ -213,7 +210,7 @@ def find_candidates(
 
 
 def compress_heights(points: Float, gap_m: Float) -> Float:
-    """Return the (N,3) points, with heights compressed where rings are over 0.35 m apart.
+    """Return the (N,3) points, with heights compressed until rings are at most 0.35 m apart.
 
     Otherwise the rings of an object would be too far apart to be linked.
 
@@ -235,10 +232,9 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Return the number of clusters of seeds and points close to seeds, and the (N,) clusters.
+    """Return the clusters of seeds and of points within 0.4 m of seeds, linked within 0.6 m.
 
-    Points within 0.4 m of a seed are candidates. A seed with a share of seeds below 0.4 around it,
-    as in a hedge, does not count. Candidates linked by steps of up to 0.6 m are one cluster.
+    Seeds with a share of other seeds below 0.4 around them, as in a hedge, do not count.
 
     Args:
         points: (N,3) metres.

@@ -181,14 +181,9 @@ def assign_points(
 def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
     """Return (N,) the index in ``objects`` of the nearest object at each point of a sweep, or -1.
 
-    A point belongs to an object that is tracked at the sweep if it lies near the shape and at least
-    0.2 m above the ground, or inside the outline seen from above. Points less than 0.1 m above the
-    ground belong to no object slower than 2 m/s.
-
-    Args:
-        cloud: The N points of the sweep.
-        i: Index of the sweep.
-        objects: Confirmed objects.
+    ``cloud`` holds the N points of sweep index i. A point belongs to an object if it lies near the
+    shape and at least 0.2 m above the ground, or inside the outline seen from above. Points less
+    than 0.1 m above the ground belong to no object slower than 2 m/s.
     """
     instance = np.full(len(cloud.points), -1, np.int32)
     least_m = np.full(len(cloud.points), np.inf)

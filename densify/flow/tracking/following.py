@@ -64,12 +64,10 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_nearness(self, nearness: Bytes, group: Group, velocities: Float) -> None:
-        """Raise nearness, in place, to that of a group's N points moved at V velocities.
+        """Raise ``nearness`` (V,N), in place, to that of a group's N points at V velocities.
 
-        Args:
-            nearness: (V,N) from 0 (no candidate within 0.6 m) to 255 (at a candidate).
-            group: The points. Each is moved to the time when this sweep fired at its new position.
-            velocities: (V,3) m/s, world.
+        Nearness is from 0 (no candidate within 0.6 m) to 255. The points are moved at velocities
+        (V,3), m/s, world, to the time when this sweep fired at the new position.
         """
         if self.tree is None:
             return

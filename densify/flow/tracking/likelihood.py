@@ -129,9 +129,7 @@ def judge(
     """Return the log odds that a smoothed track moves, minus infinity below 3 observations.
 
     Args:
-        track: A track, after `Track.smooth`.
         obstacles: Points above the ground of each sweep of the stretch.
-        space: Free space that the sweeps observed.
         objects: Objects confirmed so far. Their returns do not count against the track.
         record: Called with the track and its evidence, unless it has fewer than 3 observations.
     """

@@ -77,10 +77,7 @@ class Softened:
         return np.asarray(np.mean(velocities, axis=0))
 
     def carry(self, i: int, j: int) -> Float:
-        """Return the (n,3) points of snapshot i at the time of snapshot j, object's frame.
-
-        A rigid object (``alpha`` infinite) keeps its points.
-        """
+        """Return the (n,3) points of snapshot i at the time of snapshot j, object's frame."""
         points = self.snapshots[i].points
         if i == j or np.isinf(self.alpha):
             return points
@@ -237,8 +234,7 @@ class _FlowSolver:
     def between(self, i: int, time_s: float) -> Float:
         """Return the (N,3) nodes of snapshots i and i + 1, both moved to a time between them."""
         flows = self._by_hop()
-        begin_s = self._snapshots[i].time_s
-        end_s = self._snapshots[i + 1].time_s
+        begin_s, end_s = self._snapshots[i].time_s, self._snapshots[i + 1].time_s
         share = (time_s - begin_s) / (end_s - begin_s)
         earlier = self._nodes[i] + share * flows[i, i + 1]
         later = self._nodes[i + 1] + (1 - share) * flows[i + 1, i]
@@ -252,13 +248,9 @@ class _FlowSolver:
             nodes = self._nodes[a]
             points = self._snapshots[a].points
             # With equal displacements, 0, the nearest nodes are chosen by position alone.
-            no_displacement = np.zeros_like(points)
-            no_node_displacement = np.zeros_like(nodes)
-            point_flow = _interpolate(points, no_displacement, nodes, no_node_displacement, flow)
-            if b > a:
-                to_next[a] = point_flow
-            else:
-                to_previous[a] = point_flow
+            zero, node_zero = np.zeros_like(points), np.zeros_like(nodes)
+            flows = to_next if b > a else to_previous
+            flows[a] = _interpolate(points, zero, nodes, node_zero, flow)
         return tuple(to_next), tuple(to_previous)
 
     def _by_hop(self) -> dict[tuple[int, int], Float]:
