@@ -56,15 +56,14 @@ def close_bodies(
 
 
 def find_far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
-    """Return (H,W) True where ``depth_m`` (H,W) is far behind a body's front, as behind glass."""
+    """Return (H,W) True where ``depth_m`` (H,W) is over 0.6 m behind the front of a body."""
     inverse = fronts(bodies, exposure)
     # depth > front + _DEEP_M, times the inverse depth of the front
-    is_far: Bool = (inverse > 0) & (depth_m * inverse > 1 + _DEEP_M * inverse)
-    return is_far
+    return (inverse > 0) & (depth_m * inverse > 1 + _DEEP_M * inverse)
 
 
 def fronts(bodies: Iterable[MovingBody], exposure: Exposure) -> Float:
-    """Return (H,W) inverse depths of the nearest front of the bodies in 1/m, 0 for none."""
+    """Return the (H,W) inverse depths (1/m) of the bodies' nearest front in a view, 0 for none."""
     inverse = np.zeros((exposure.camera.height_px, exposure.camera.width_px))
     for body in bodies:
         front = _Front.of(body, exposure, 0)
@@ -136,8 +135,7 @@ class _Front(NamedTuple):
         )
         # The blur, a Gaussian, leaves this part of _PRIOR rays in the pixel where they end.
         num_ended = num_ended + _PRIOR / (2 * np.pi * blur_px.prod())
-        share: Float = np.where(self.inverse > 0, num_ended / (num_ended + num_passed), 0)
-        return share
+        return np.where(self.inverse > 0, num_ended / (num_ended + num_passed), 0)
 
 
 def _image_box(sight: Sight, exposure: Exposure, margin_px: int) -> tuple[slice, slice]:
@@ -197,8 +195,7 @@ def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
     on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
     # The surface is the front of the hull, with a smooth offset through the returns.
     offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
-    surface: Float = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
-    return surface
+    return np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
 
 
 class _Shown(NamedTuple):
@@ -258,8 +255,7 @@ def _erode(mask: Bool, margin_px: float) -> Bool:
     # With a border, a mask of the whole box has distances too.
     padded = np.pad(mask, 1, mode="edge").astype(np.uint8)
     distance_px = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    eroded: Bool = distance_px > margin_px
-    return eroded
+    return distance_px > margin_px
 
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:

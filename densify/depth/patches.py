@@ -310,8 +310,7 @@ def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
     paint(points.uv, points.inverse, points.slope, half_px, nearest)
     with np.errstate(divide="ignore"):
         nearest_m = 1 / nearest[pixel_of(points.uv)].astype(np.float64)  # inf without a patch
-    occluded: Bool = points.depth - nearest_m > hidden_m(nearest_m)
-    return occluded
+    return points.depth - nearest_m > hidden_m(nearest_m)
 
 
 @Kernel

@@ -85,8 +85,7 @@ def _scanner_origins(sweep: Sweep) -> Float:
 def _find_returns(sweep: Sweep, numbers: Int) -> Int:
     """Return the (K,) indices in a sweep of the returns with these numbers in the recording."""
     order = np.argsort(sweep.row, kind="stable")
-    returns: Int = order[np.searchsorted(sweep.row, numbers, sorter=order)]
-    return returns
+    return order[np.searchsorted(sweep.row, numbers, sorter=order)]
 
 
 def half_spaces(corners: Float) -> Float:
@@ -120,13 +119,12 @@ def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float,
 
 
 def passes_near(corners: Float, start: Float, direction: Float) -> Bool:
-    """Return (K,) True for lines of `find_crossing` that meet a sphere around corners (V,3)."""
+    """Return (K,) True for lines as in `find_crossing` that meet a sphere around corners (V,3)."""
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
     # The distance of a line from the middle, times the length of its direction
     scaled_m = np.linalg.norm(np.cross(start - middle, direction), axis=1)
-    passes: Bool = scaled_m <= radius_m * np.linalg.norm(direction, axis=1)
-    return passes
+    return scaled_m <= radius_m * np.linalg.norm(direction, axis=1)
 
 
 class ObjectRays(NamedTuple):
@@ -215,8 +213,7 @@ def _may_meet(xy: Float32, bound_m: float, corners: Float) -> Bool:
     tangent = np.float32(radius_m / np.sqrt(range_m**2 - radius_m**2))  # of half its angle
     forward_m = axis_x * xy[0] + axis_y * xy[1]
     sideways_m = axis_y * xy[0] - axis_x * xy[1]
-    may_meet: Bool = (forward_m > range_m - radius_m) & (abs(sideways_m) <= tangent * forward_m)
-    return may_meet
+    return (forward_m > range_m - radius_m) & (abs(sideways_m) <= tangent * forward_m)
 
 
 class MovingBody(NamedTuple):
@@ -264,7 +261,10 @@ def find_moving_bodies(
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies that still span a volume without the points and rays of a sweep."""
+    """Return the bodies without a sweep's rays, if they still span a volume without its points.
+
+    ``cloud`` holds the points of the other sweeps; ``frame`` is the number of the sweep left out.
+    """
     reduced_bodies = {}
     for instance, body in bodies.items():
         corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
@@ -363,8 +363,7 @@ def _reach_corners(track: ObjectTrack, key: int) -> Float:
 def corners_of(size_m: Float) -> Float:
     """Return the (8,3) corners, bottom and top in turn, of a box of (3,) m around the origin."""
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1)
-    corners: Float = signs.reshape(-1, 3) * size_m / 2
-    return corners
+    return signs.reshape(-1, 3) * size_m / 2
 
 
 def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectTrack:
@@ -437,7 +436,10 @@ def _box_spaces(low: Float, high: Float) -> Float:
 
 
 def grow_box(track: ObjectTrack, axis: int, before_m: float, after_m: float) -> ObjectTrack:
-    """Return the track, its box longer along ``axis`` by metres at its lower and upper end."""
+    """Return the track, its box longer along an axis (0, 1 or 2) of the object's frame.
+
+    It grows by ``before_m`` at the lower and ``after_m`` at the upper end of the axis.
+    """
     size_m, T_key_object = track.size_m.copy(), track.T_key_object.copy()
     size_m[axis] += before_m + after_m
     shift_m = (after_m - before_m) / 2

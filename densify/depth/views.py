@@ -150,7 +150,7 @@ class Views:
     def see_far(
         self, world: StaticWorld, T_key_world: Float, stretch: Stretch, static_only: bool
     ) -> SeenCloud:
-        """Return the points of sweeps beyond the window as cameras see them, see `far_cloud`."""
+        """Return the points of sweeps beyond the window as cameras see them; see `far_cloud`."""
         cloud, surface = far_cloud(
             world, T_key_world, stretch, self.key, self.exposures, static_only
         )
@@ -392,7 +392,7 @@ class HeldOut:
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """Return the ground truth of a key sweep; ``cloud`` has velocities of moving points."""
+        """Return the ground truth of a key sweep from the window's cloud, with its velocities."""
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
         seen = views.see(key_cloud)
@@ -422,7 +422,7 @@ class HeldOut:
         return SeenCloud(cloud, seen.patches.select(keep), in_view, bodies)
 
     def judged_maps(self, seen: SeenCloud, visible: bool) -> dict[str, JudgedMap]:
-        """Return each map made without the key sweep with its truth, by name; {} without points."""
+        """Return each map of a cloud without the key sweep, by name; {} if no points remain."""
         neighbours_only = self.without_key(seen)
         if not len(neighbours_only.cloud):
             return {}
@@ -439,8 +439,9 @@ class HeldOut:
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.
 
-        Besides `depth_scores` these are ``curve`` (precision over density), ``reliability``, and
-        ``unjudged``, the filled share without a key return within a ray spacing.
+        The keys are names of maps, then those of `depth_scores`, ``curve`` (precision by density),
+        ``reliability``, and ``unjudged``: the shares of ``all``, ``moving`` and ``static`` filled
+        pixels without a key return within a ray spacing.
         """
         scores: dict[str, Any] = {}
         for name, judged in self.judged_maps(seen, visible).items():

@@ -75,9 +75,6 @@ def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> 
         settings: Configuration of the run.
         spec: Engine as ``NAME`` or ``NAME:ARGUMENT``, such as ``groups``; None for ``flow.engine``.
 
-    Returns:
-        The motion. The engine may compute it only when its ``flow`` is called.
-
     Raises:
         InputError: No engine has this name, or the engine rejects its argument.
     """

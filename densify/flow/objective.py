@@ -229,7 +229,7 @@ def _descending_alphas(first: float, alpha: float) -> list[float]:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion by the published objective, above the ground; no ``argument`` is used."""
+    """Return the motion by the published objective, above the ground; ``argument`` is not used."""
 
     def step(i: int, j: int) -> FlowField:
         return _sweep_flow(scene, i, j, settings)
@@ -259,7 +259,7 @@ def flow_between(
     settings: ObjectiveSettings,
     initial: ArrayLike | None = None,
 ) -> FlowField:
-    """Return the flow of one cloud to another by the published objective, without ego-motion.
+    """Return the flow of one cloud to another by the published objective, in their common frame.
 
     Args:
         source: (N,3) metres.

@@ -216,7 +216,7 @@ def _times_as_shares(times_ns: tuple[Int, Int] | None) -> _PointTimes | None:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the chained `estimate_flow` of neighbouring sweeps, for recordings of two sweeps."""
+    """Return the motion of the engine ``pairs``: chained `estimate_flow` of neighbouring sweeps."""
     # The engine ``groups`` is the default of `estimate_flow`, which does not know ``pairs``.
     pair_settings = replace(settings, flow=replace(settings.flow, engine="groups"))
 

@@ -50,7 +50,7 @@ class SweepPoints:
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
-        """Return the points of the sweep with index i that are over 0.08 m above the ground."""
+        """Return the points over 0.08 m above the ground of sweep index i with its obstacles."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)

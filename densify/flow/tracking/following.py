@@ -238,8 +238,8 @@ _MAX_MISSED_BATCHES, MAX_MISSED_S = 1, 0.2
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
     """Return the clusters that may start a track: batch index, (K,) rows of the batch's obstacles.
 
-    They have at least 8 points, 40 % of them seeds. Large clusters come first. Those less than
-    0.5 s from an end of the stretch count as smaller.
+    They have at least 8 points, 40 % of them seeds. The largest come first; those less than 0.5 s
+    from an end of the stretch count as smaller.
     """
     starts = []
 

@@ -41,7 +41,7 @@ class Places(NamedTuple):
     num_free: int  # number of positions in observed free space
 
     def add(self, is_occupied: Bool, is_free: Bool) -> Places:
-        """Return the counts with those of more positions, given as masks."""
+        """Return the counts with those of more positions (P,), occupied or free by two masks."""
         return Places(
             self.num_occupied + int(is_occupied.sum()), self.num_free + int(is_free.sum())
         )
@@ -278,5 +278,4 @@ def _returns_near(
 @cache
 def fitted_weights() -> Mapping[str, float]:
     """Return the fitted weight of each term by its name, and the ``price``."""
-    weights: Mapping[str, float] = read_json(_FILE)["weights"]
-    return weights
+    return read_json(_FILE)["weights"]

@@ -130,14 +130,12 @@ class Path:
     def __call__(self, time_s: float | Float) -> Float:
         """Return the states (..., d) at the given times (...) in seconds."""
         (cubic, square, linear, constant), since_s = self._piece_at(time_s)
-        state: Float = ((cubic * since_s + square) * since_s + linear) * since_s + constant
-        return state
+        return ((cubic * since_s + square) * since_s + linear) * since_s + constant
 
     def rate(self, time_s: float | Float) -> Float:
         """Return the derivatives (..., d) of the states per second at the given times (...)."""
         (cubic, square, linear, _), since_s = self._piece_at(time_s)
-        rate: Float = (3 * cubic * since_s + 2 * square) * since_s + linear
-        return rate
+        return (3 * cubic * since_s + 2 * square) * since_s + linear
 
     def travelled_m(self) -> float:
         """Return the horizontal distance between the first and the last position of the fit."""
@@ -232,11 +230,11 @@ class Track:
         self.path = Path.fit(times_s, states, weights)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
-        """Move (N,3) points from the object's frame to the world at a time or (N,) times."""
+        """Move (N,3) points from the object's frame to the world at a time (s) or (N,) times."""
         return apply(self.path(time_s), points, self.centre)
 
     def undo(self, points: Float, time_s: float | Float) -> Float:
-        """Move (N,3) points from the world at a time, or at (N,) times, to the object's frame."""
+        """Move (N,3) points from the world at a time (s), or (N,) times, to the object's frame."""
         return undo(self.path(time_s), points, self.centre)
 
     def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
@@ -327,8 +325,7 @@ class Shape:
         """Return (N,) True for points (N,3, object's frame) inside the outline, seen from above."""
         if not len(self.edges):
             return np.zeros(len(points), bool)
-        inside: Bool = (points[:, :2] @ self.edges[:, :2].T + self.edges[:, 2] < _OUTLINE_M).all(1)
-        return inside
+        return (points[:, :2] @ self.edges[:, :2].T + self.edges[:, 2] < _OUTLINE_M).all(1)
 
     def near(self, points: Float, within_m: float) -> Bool:
         """Return (N,) True for points (N,3, object's frame) within ``within_m`` or the outline."""
