@@ -90,8 +90,8 @@ def _march(steps):  # type: ignore[no-untyped-def]
                     next_steps = steps[d, row, 2 + column + u1]
                     line[column] = 0 if line[column] == 0 else min(next_steps, 254) + 1
                 continue
-            # 0 steps if known, 1 if the pixel one step on is, else two more than the pixel two on. A
-            # sum above 255 (NONE) would overflow.
+            # 0 steps if known, 1 if the pixel one step on is, else two more than the pixel two on.
+            # A sum above 255 (NONE) would overflow.
             after_one = steps[d, row + v1, 2 + u1 : width - 2 + u1]
             after_two = steps[d, row + v2, 2 + u2 : width - 2 + u2]
             for j in range(len(line)):

@@ -183,7 +183,7 @@ def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: C
 
     ``cloud`` holds the N points of sweep index i. A point belongs to an object if it lies near the
     shape and at least 0.2 m above the ground, or inside the outline seen from above. Points less
-    than 0.1 m above the ground belong to no object slower than 2 m/s.
+    than 0.1 m above the ground belong to no object of up to 2 m/s.
     """
     instance = np.full(len(cloud.points), -1, np.int32)
     least_m = np.full(len(cloud.points), np.inf)

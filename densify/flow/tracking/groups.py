@@ -122,7 +122,7 @@ def find_group_motion(
     """Return the motion of the objects found among the points of each sweep that may move.
 
     Args:
-        scene: Registered sweeps. Points of sweeps that are not asked for stay static.
+        scene: Registered sweeps. Points of batches without a sweep that is asked for stay static.
         candidates: For each sweep, its C points above the ground, and which may move.
         velocities_m_s: For each sweep, (C,3) approximate velocities of these points, world frame.
             None estimates them by a vote of neighbouring sweeps.
