@@ -44,7 +44,7 @@ def seen_from(stretch: Stretch, shift_m=(0.0, 0.0, 0.0), yaw_deg: float = 0.0) -
 
 def moving(stretch: Stretch) -> np.ndarray:
     motion = motion_in(stretch, ground(stretch))
-    return np.concatenate([instance >= 0 for instance in motion.instance])
+    return np.concatenate([instance >= 0 for instance in motion.track_of_point])
 
 
 def test_candidates_are_the_same_groups(stretch: Stretch) -> None:

@@ -38,9 +38,9 @@ def numbers(part_of: Callable[[np.ndarray], np.ndarray], *speeds_m_s: float) -> 
     k = scene.track_of(1)
     track = motion.tracks[k]
     every = []
-    for registered, instance in zip(scene.stretch.sweeps, motion.instance, strict=True):
+    for registered, instance in zip(scene.stretch.sweeps, motion.track_of_point, strict=True):
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
-        own = motion.number[instance] == motion.number[k]
+        own = motion.object_of_track[instance] == motion.object_of_track[k]
         every.append((points, own & (instance >= 0)))
     times_s = space.clock.time_s
     along = [track.undo(points, s)[:, 0] for (points, _), s in zip(every, times_s, strict=True)]
@@ -58,7 +58,7 @@ def numbers(part_of: Callable[[np.ndarray], np.ndarray], *speeds_m_s: float) -> 
         coefficients = path.coefficients + (at_s - mid_s)[:, None] * off
         wrong.path = type(path)(coefficients, path.begin_s, path.end_s, path.residual_m)
         tracks.append(wrong)
-    return join_pieces(scene.stretch, tracks, pieces, space).number
+    return join_pieces(scene.stretch, tracks, pieces, space).object_of_track
 
 
 def halves(x: np.ndarray) -> np.ndarray:

@@ -100,16 +100,14 @@ def nearest_pixel(mask: Bool) -> tuple[Int, Int]:
 
 
 def tolerance(depth_m: Float32, camera: Camera) -> Float:
-    """Return the error from which a depth in metres is an outlier, as a share of the depth."""
+    """Return the error from which depths ``depth_m`` (m) are outliers, as shares of the depths."""
     px = depth_m.astype(np.float64) / (camera.focal_px * KITTI_BASELINE_M)
-    share: Float = np.maximum(OUTLIER_PX * px, OUTLIER_FRACTION)
-    return share
+    return np.maximum(OUTLIER_PX * px, OUTLIER_FRACTION)
 
 
 def _logarithm(values: Float | Float32, least: float) -> Float:
     """Return log10(1 + values / least): values from 0, those below ``least`` are close to 0."""
-    logarithm: Float = np.log10(values / least + 1)
-    return logarithm
+    return np.log10(values / least + 1)
 
 
 def _window_px(spacings: float, gap_px: float) -> int:
@@ -119,8 +117,7 @@ def _window_px(spacings: float, gap_px: float) -> int:
 
 def _mean(mask: Bool, size_px: int) -> Float32:
     """Return the (H,W) share of the mask in the window around each pixel; outside it is False."""
-    mean: Float32 = ndimage.uniform_filter(mask.astype(np.float32), size_px, mode="constant")
-    return mean
+    return ndimage.uniform_filter(mask.astype(np.float32), size_px, mode="constant")
 
 
 def _log_rejected_share(record: MapRecord, size_px: int) -> Float:
@@ -149,7 +146,7 @@ def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
 
 
 def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) -> Float32:
-    """Return (P,) ``-log10(P) / 5`` of pixels with `features` (P,10), by (10,) ``weights``."""
+    """Return (P,) confidences of pixels with `features` (P,10), by (10,) weights, or `WEIGHTS`."""
     if weights is None:
         weights = np.array([*WEIGHTS.values()])
     log_p = -np.logaddexp(0, -(evidence @ weights)) / np.log(10)

@@ -154,11 +154,11 @@ class InView(NamedTuple):
     points_cam: Float  # (K,3) positions as in `Sight`
     uv: Float  # (K,2) pixel coordinates as in `Sight`
 
-    def joined(self, appended: InView, num: int) -> InView:
-        """Return the points with those of a cloud appended to this one of ``num`` points."""
+    def joined(self, appended: InView, num_points: int) -> InView:
+        """Return the points in view of two clouds joined to one; the first has ``num_points``."""
         return InView(
             self.exposure,
-            np.concatenate([self.rows, num + appended.rows]),
+            np.concatenate([self.rows, num_points + appended.rows]),
             np.concatenate([self.points_cam, appended.points_cam]),
             np.concatenate([self.uv, appended.uv]),
         )
@@ -347,7 +347,10 @@ class PointsInImage(NamedTuple):
 
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:
-    """Return the points of the cloud in the view, with the patches' size and slope in pixels."""
+    """Return the points of a cloud in an image, with size and slope of their patches in pixels.
+
+    They are ordered by the rows of the image. Where a patch is seen edge-on its slope is 0.
+    """
     # In the order of the image's rows, points that are used together lie together in memory.
     order = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
     exposure = view.exposure
@@ -392,14 +395,17 @@ def _lens_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> _Scale:
     """Return the scale of points for any lens and measure; arguments as `_pinhole_scale`."""
-    # If a point moves on the plane n · p = d until the image moves by one pixel, p moves by
-    # δ = J⁺ - p (n · J⁺) / d, the inverse depth by -δ_z / z², and the inverse range by -p · δ / r³.
+    # J (K,2,3): px that a point moves right and down in the image, per metre that it moves in space
     J = pixels_per_metre(exposure.camera, points_cam)
     focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
+
+    # Slope: a point p moves on its plane n · p = d until it has moved by one pixel, by
+    # δ = J⁺ - p (n · J⁺) / d. The pseudoinverse J⁺ moves it across its ray by one pixel, the second
+    # term along the ray back to the plane. The inverse depth changes by -δ_z / z², and the inverse
+    # range by -p · δ / r³, where p · J⁺ is 0.
     distance = np.einsum("ij,ij->i", normal, points_cam)  # d
     with np.errstate(divide="ignore", invalid="ignore"):
         metres_per_px = J.transpose(0, 2, 1) @ np.linalg.inv(J @ J.transpose(0, 2, 1))  # J⁺
-        # - (n · J⁺) / d: the share of its own range by which the point moves along its ray
         range_share = -np.einsum("ij,ijk->ik", normal, metres_per_px) / distance[:, None]
         if exposure.measure == "z":
             z = points_cam[:, 2:]
@@ -407,7 +413,7 @@ def _lens_scale(
         else:
             slope = -range_share / np.linalg.norm(points_cam, axis=1, keepdims=True)
 
-    # Rays of a scanner are spaced in azimuth and in elevation, about the key's upward axis.
+    # Spacing: rays of a scanner are spaced in azimuth and elevation, about the key's upward axis.
     azimuth_axis = np.cross(exposure.T_cam_key[:3, 2], points_cam)
     azimuth_axis /= np.maximum(np.linalg.norm(azimuth_axis, axis=1, keepdims=True), 1e-9)
     elevation_axis = np.cross(points_cam, azimuth_axis)

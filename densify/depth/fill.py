@@ -50,7 +50,11 @@ _SPOT_PX = 4  # greatest radius of a laser's spot
 
 
 def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
-    """Accept boundary pixels by ``project.rims``: by votes (``image``), all (``keep``) or none."""
+    """Accept boundary pixels of the record, in place, by ``project.rims``; others are rejected.
+
+    ``image`` accepts those with 97 % of the votes (none without an image), ``keep`` all, and any
+    other value none.
+    """
     pixel = np.flatnonzero(record.boundary_m)
     depth_m = record.boundary_m.flat[pixel]
     if record.lab.size:
@@ -65,7 +69,10 @@ def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
 
 
 def fill(record: MapRecord, reach: float) -> None:
-    """Fill pixels between measured pixels where nine tenths of the votes (`votes_for`) agree."""
+    """Fill pixels between measured pixels where nine tenths of the votes (`votes_for`) agree.
+
+    The record changes in place, ``reach`` is as in `fill_between`. Others are rejected.
+    """
     empty = record.filled_m == 0
     fill_between(record.filled_m, record.tilt, record.spacing_px, reach)
     _reject_unconfirmed(record, empty, _FILL_SHARE)

@@ -51,8 +51,8 @@ ALL_ROUND = 3.0
 """Extent of a surface without a depth discontinuity nearby, in radii of a laser's spot."""
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
-# Rows of the array that `_settle` fills
-_DEPTH, _SWEEPS, _NEAREST, _EDGE, _NUM_SETTLED = range(5)
+# Rows of the array that `_measure_pixels` fills, with the meaning of the fields of `_Winners`
+_DEPTH, _SWEEPS, _NEAREST_IN_TIME, _EDGE, _NUM_ROWS = range(5)
 
 
 class MapInputs(NamedTuple):
@@ -121,9 +121,10 @@ class MapRecord:
 
 
 def measure(inputs: MapInputs) -> MapRecord:
-    """Return the record of a map's measured and boundary pixels.
+    """Return the record of a map's measured and boundary pixels, nothing interpolated or rejected.
 
     Points beyond the window only measure what it leaves empty, away from depth discontinuities.
+    Without ``visibility`` in the settings each pixel takes its nearest point.
     """
     camera = inputs.camera
     points = points_in_image(inputs.cloud, inputs.view, inputs.patches)
@@ -215,7 +216,7 @@ class _Winners(NamedTuple):
     depth_m: Float32  # (P,) depth of the plane at the pixel's centre
     num_sweeps: Float32  # (P,) number of sweeps that agree with the plane
     # (P,) 1 if, of the sweeps around the pixel, the one nearest to the key is among them, else 0
-    is_nearest: Float32
+    is_nearest_in_time: Float32
     edge: Float32  # (P,) distance from a discontinuity, in radii of a laser's spot
 
 
@@ -238,7 +239,7 @@ def _measure_visible(
         reasons[winners.point[~is_inside]] = Reason.EDGE
         is_judged = points.far
     else:
-        is_supported = winners.is_nearest > 0
+        is_supported = winners.is_nearest_in_time > 0
         is_inside = winners.edge >= 1  # else it is a boundary pixel
         is_used = is_supported
         is_judged = ~points.far
@@ -256,17 +257,17 @@ def _find_winners(
     rank = np.where(is_hidden, hidden_rank, points.age_ns)
     start, order = sorted_by_pixel(points, rank, camera)
     has_depth = record.depth_m > 0
-    settled = np.zeros((_NUM_SETTLED, has_depth.size), np.float32)
+    values = np.zeros((_NUM_ROWS, has_depth.size), np.float32)
     by_pixel = _ByPixel(select_rows(points, order), is_hidden[order], start, has_depth.shape)
-    _settle.over_rows(has_depth.size, by_pixel, has_depth.ravel(), settled)
-    pixel = np.flatnonzero(settled[_DEPTH])
+    _measure_pixels.over_rows(has_depth.size, by_pixel, has_depth.ravel(), values)
+    pixel = np.flatnonzero(values[_DEPTH])
     return _Winners(
         pixel=pixel,
         point=order[start[pixel]],
-        depth_m=settled[_DEPTH, pixel],
-        num_sweeps=settled[_SWEEPS, pixel],
-        is_nearest=settled[_NEAREST, pixel],
-        edge=settled[_EDGE, pixel],
+        depth_m=values[_DEPTH, pixel],
+        num_sweeps=values[_SWEEPS, pixel],
+        is_nearest_in_time=values[_NEAREST_IN_TIME, pixel],
+        edge=values[_EDGE, pixel],
     )
 
 
@@ -317,8 +318,8 @@ def _count(bits):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _compare(by_pixel, i, u0, v0, centre, tolerance, edge_px, moments, extent):  # type: ignore[no-untyped-def]
-    """Compare the points around pixel (v0, u0) with the tangent plane of its winner, point i.
+def _compare(by_pixel, winner, u0, v0, centre, tolerance, edge_px, moments, extent):  # type: ignore[no-untyped-def]
+    """Compare the points around pixel (v0, u0) with the tangent plane of its ``winner``, a point.
 
     The plane has the inverse depth ``centre`` (1/m) at the pixel. A point agrees if it deviates by
     at most ``tolerance`` (1/m). Its deviation is added to ``moments`` (9,). In a square of half
@@ -326,19 +327,22 @@ def _compare(by_pixel, i, u0, v0, centre, tolerance, edge_px, moments, extent): 
 
     Returns:
         sweeps: Bit set of the agreeing sweeps in the window.
-        is_nearest: True if no other sweep in the window is nearer in time to the key.
+        is_nearest_in_time: True if no other sweep in the window is nearer in time to the key.
         has_background: True if a point in the square is clearly behind the plane.
     """
     points, is_hidden, start, shape = by_pixel
     uv, inverse, age_ns = points.uv, points.inverse, points.age_ns
-    slope_u, slope_v, inverse_i = points.slope[i, 0], points.slope[i, 1], inverse[i]
+    slope_u, slope_v = points.slope[winner, 0], points.slope[winner, 1]
     # A step of depth (m), times the squared inverse depth, is one of inverse depth (1/m).
-    background_step = (HIDDEN_M + HIDDEN_FRACTION / inverse_i) * inverse_i * inverse_i
-    reach_u = _window(_REACH * points.spacing_px[i, 0])
-    reach_v = _window(_REACH * points.spacing_px[i, 1])
+    background_step = HIDDEN_M + HIDDEN_FRACTION / inverse[winner]
+    background_step = background_step * inverse[winner] * inverse[winner]
+    # The window of the pixel. The search covers it and the square.
+    reach_u = _window(_REACH * points.spacing_px[winner, 0])
+    reach_v = _window(_REACH * points.spacing_px[winner, 1])
     wide_u, wide_v = max(reach_u, _window(edge_px)), max(reach_v, _window(edge_px))
     sweeps, has_background = np.int64(0), False
-    agreeing_ns = other_ns = age_ns[i]  # ages of the sweeps nearest to the key
+    # Least age of a sweep that agrees, and of one that does not; at least the winner itself agrees.
+    agreeing_ns = other_ns = age_ns[winner]
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
         for j in range(start[v * shape[1] + left], start[v * shape[1] + right + 1]):
@@ -352,7 +356,8 @@ def _compare(by_pixel, i, u0, v0, centre, tolerance, edge_px, moments, extent): 
                 has_background |= is_close and deviation < -background_step
                 other_ns = min(other_ns, age_ns[k]) if in_window else other_ns
                 continue
-            # No branches: half of them would be predicted wrongly. A bit of 63 for each sweep.
+            # No branches: half of them would be predicted wrongly. The 63 bits of a positive number
+            # are for frame numbers modulo 63.
             sweeps |= np.int64(in_window) << np.int64(points.frame[k] % 63)
             agreeing_ns = min(agreeing_ns, age_ns[k]) if in_window else agreeing_ns
             _extend(extent, du if is_close else 0.0, dv if is_close else 0.0)
@@ -363,35 +368,38 @@ def _compare(by_pixel, i, u0, v0, centre, tolerance, edge_px, moments, extent): 
 
 
 @Kernel
-def _settle(first, last, by_pixel, has_depth, settled):  # type: ignore[no-untyped-def]
-    """Fill ``settled`` (4,P), as in `_Winners`, at pixels without a depth that have a winner."""
+def _measure_pixels(first, last, by_pixel, has_depth, values):  # type: ignore[no-untyped-def]
+    """Fill ``values`` (4,P), as in `_Winners`, at pixels without a depth that have a winner."""
     moments, extent = np.empty(9), np.empty(8)
     points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
     for p in range(first, last):
-        i = start[p]
-        if has_depth[p] or i == start[p + 1] or by_pixel.is_hidden[i]:
+        # The first point of a pixel wins, unless there is none or only occluded ones.
+        winner = start[p]
+        if has_depth[p] or winner == start[p + 1] or by_pixel.is_hidden[winner]:
             continue
 
         # The tangent plane of the winner, at the pixel's centre
         v0, u0 = p // width, p % width
-        inverse, uv, slope = points.inverse[i], points.uv[i], points.slope[i]
+        inverse, uv, slope = points.inverse[winner], points.uv[winner], points.slope[winner]
         centre = inverse + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
-        # In inverse depth (1/m), as in `_compare`
+        # From a tolerance of depth (m) to one of inverse depth (1/m)
         tolerance = (AGREE_M + AGREE_FRACTION / inverse) * inverse * inverse
-        spot_px = FOOTPRINT * points.spacing_px[i, 0] + _SLACK_M * points.focal_px[i, 0] * inverse
+        slack_px = _SLACK_M * points.focal_px[winner, 0] * inverse
+        spot_px = FOOTPRINT * points.spacing_px[winner, 0] + slack_px
 
-        # The depth: the plane, corrected by the mean deviation of the agreeing points
+        # The depth: that plane, corrected at the pixel's centre. The correction is the value there
+        # of a second plane, through the deviations of the agreeing points from the first.
         moments[:], extent[:] = 0.0, 0.0
-        sweeps, is_nearest, has_background = _compare(
-            by_pixel, i, u0, v0, centre, tolerance, spot_px + _EDGE_WINDOW_PX, moments, extent
+        sweeps, is_nearest_in_time, has_background = _compare(
+            by_pixel, winner, u0, v0, centre, tolerance, spot_px + _EDGE_WINDOW_PX, moments, extent
         )
         deviation, _, _ = plane(moments, _RIDGE_PX2)
         deviation = min(max(deviation, -tolerance), tolerance)
-        settled[_DEPTH, p] = 1 / limit_inverse(centre + deviation, inverse)
-        settled[_SWEEPS, p] = _count(sweeps)
-        settled[_NEAREST, p] = is_nearest
+        values[_DEPTH, p] = 1 / limit_inverse(centre + deviation, inverse)
+        values[_SWEEPS, p] = _count(sweeps)
+        values[_NEAREST_IN_TIME, p] = is_nearest_in_time
 
         # The discontinuity is where the surface ends first.
-        settled[_EDGE, p] = ALL_ROUND
+        values[_EDGE, p] = ALL_ROUND
         if has_background and spot_px > 0:
-            settled[_EDGE, p] = extent.min() / spot_px
+            values[_EDGE, p] = extent.min() / spot_px

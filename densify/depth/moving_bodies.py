@@ -41,10 +41,11 @@ _AGREES = 2.0  # tolerance, as a multiple of that between two static points of a
 def close_bodies(
     record: MapRecord, cloud: Cloud, exposure: Exposure, bodies: Mapping[int, MovingBody]
 ) -> None:
-    """Put the surfaces of moving bodies into the record; ``on_body`` marks their pixels.
+    """Put the surfaces of moving bodies into the record, in place; ``on_body`` marks their pixels.
 
     Depths clearly in front stay. Elsewhere inside the outline of a hull only depths of moving
-    objects stay. Pixels with a return of the body on its surface count as measured.
+    objects stay. Pixels with a return of the body on its surface count as measured. ``bodies`` are
+    by instance number.
     """
     margin_px = round(VOTERS_REACH * float(np.median(record.gap_px)))
     for instance, body in bodies.items():
@@ -55,15 +56,14 @@ def close_bodies(
 
 
 def find_far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
-    """Return (H,W) True where ``depth_m`` (H,W) is far behind a body's front, as behind glass."""
+    """Return (H,W) True where ``depth_m`` (H,W) is over 0.6 m behind the front of a body."""
     inverse = fronts(bodies, exposure)
     # depth > front + _DEEP_M, times the inverse depth of the front
-    is_far: Bool = (inverse > 0) & (depth_m * inverse > 1 + _DEEP_M * inverse)
-    return is_far
+    return (inverse > 0) & (depth_m * inverse > 1 + _DEEP_M * inverse)
 
 
 def fronts(bodies: Iterable[MovingBody], exposure: Exposure) -> Float:
-    """Return (H,W) inverse depths of the nearest front of the bodies in 1/m, 0 for none."""
+    """Return the (H,W) inverse depths (1/m) of the bodies' nearest front in a view, 0 for none."""
     inverse = np.zeros((exposure.camera.height_px, exposure.camera.width_px))
     for body in bodies:
         front = _Front.of(body, exposure, 0)
@@ -135,8 +135,7 @@ class _Front(NamedTuple):
         )
         # The blur, a Gaussian, leaves this part of _PRIOR rays in the pixel where they end.
         num_ended = num_ended + _PRIOR / (2 * np.pi * blur_px.prod())
-        share: Float = np.where(self.inverse > 0, num_ended / (num_ended + num_passed), 0)
-        return share
+        return np.where(self.inverse > 0, num_ended / (num_ended + num_passed), 0)
 
 
 def _image_box(sight: Sight, exposure: Exposure, margin_px: int) -> tuple[slice, slice]:
@@ -196,8 +195,7 @@ def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
     on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
     # The surface is the front of the hull, with a smooth offset through the returns.
     offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
-    surface: Float = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
-    return surface
+    return np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
 
 
 class _Shown(NamedTuple):
@@ -219,12 +217,17 @@ def _show(
     surface_m = (1 / surface).astype(np.float32)
     is_compact = (share[inside] >= _LEAST_OF_OTHER).mean() >= _COMPACT
 
-    # The core is well inside the closed part. It shows the body, unless something is in front.
+    # The core, well inside the closed part, shows the body, unless something is in front.
     is_hidden = (record.filled_m > 0) & (record.filled_m < surface_m - hidden_m(surface_m))
     is_closed = share >= (_LEAST_OF_COMPACT if is_compact else _LEAST_OF_OTHER)
     core = _erode(is_closed, float(np.median(record.gap_px[inside]))) & ~is_hidden
+    record.filled_m[core] = surface_m[core]
+    record.votes[core] = 1
+    slope_down, slope_right = np.gradient(surface)
+    record.tilt[core] = np.stack([slope_right, slope_down], axis=-1)[core]
 
-    # In the outline only depths of moving objects in front of the surface, or on it, stay.
+    # The outline is the rest of the front: it may show the body or what is behind. It loses all
+    # depths but those of moving objects in front of the surface, or on it.
     is_moving = (record.depth_m > 0) & cloud.moving[record.point]
     stays = is_moving & (record.depth_m <= surface_m + allowed_m)
     outline = inside & ~is_hidden & ~core & ~stays
@@ -233,12 +236,7 @@ def _show(
     for layer_m in (record.depth_m, record.filled_m, record.rejected_m):
         layer_m[outline] = 0  # a background seen past a moving object is not given back
 
-    record.filled_m[core] = surface_m[core]
-    record.votes[core] = 1
-    slope_down, slope_right = np.gradient(surface)
-    record.tilt[core] = np.stack([slope_right, slope_down], axis=-1)[core]
-
-    # The votes decide the silhouette.
+    # The votes of the pixels around decide where in the outline the silhouette is.
     pixel = np.flatnonzero(outline)
     votes = votes_for(
         record, [record.filled_m], pixel, surface_m[outline], with_shifts=not is_compact
@@ -257,8 +255,7 @@ def _erode(mask: Bool, margin_px: float) -> Bool:
     # With a border, a mask of the whole box has distances too.
     padded = np.pad(mask, 1, mode="edge").astype(np.uint8)
     distance_px = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    eroded: Bool = distance_px > margin_px
-    return eroded
+    return distance_px > margin_px
 
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:

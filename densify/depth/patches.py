@@ -57,7 +57,7 @@ def find_patches(
     Args:
         cloud: The cloud of M points.
         sensors: Scanners of the recording.
-        origins: (S,3) origins of the scanners, key sweep's lidar frame, by frame number.
+        origins: Frame number of a sweep -> (S,3) origins of its scanners, key sweep's lidar frame.
         wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
     """
     frames, index = np.unique(cloud.frame, return_inverse=True)
@@ -75,7 +75,7 @@ def fit_tangents(
     origins: Sequence[Float],
     wanted: Bool | None = None,
 ) -> Patches:
-    """Return the patches of M points, see `find_patches`.
+    """Return the patches of M points, each tangent to the neighbours in its scanner's sweep.
 
     A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
     neighbouring rays, along the azimuth and along the elevation.
@@ -86,7 +86,7 @@ def fit_tangents(
         sweep: (M,) index of each point's sweep in ``origins``.
         sensors: Scanners of the recording.
         origins: (S,3) origins of the scanners for each sweep, in the frame of the points.
-        wanted: As in `find_patches`.
+        wanted: (M,) True for points that need a patch, None for all. Other points get zeros.
     """
     normal = np.zeros((len(points), 3), np.float32)
     spacing_m = np.zeros((len(points), 2), np.float32)
@@ -270,14 +270,15 @@ def _fit_unordered(first, last, rows, spherical, table, grid, cells, normal, spa
         spacing_rad = _spacing(spherical[0, i], spherical[1, i], table)[1]
         reach = min(1 + int(_RADIUS * spacing_rad / grid.bin_rad), _MOST_CELLS)
         # The plane w = slope_u · u + slope_v · v: u and v are angles to the left and upwards on the
-        # sphere, w is inverse range, all relative to point i.
+        # sphere, w is inverse range, all relative to point i. It is fitted by least squares to all
+        # neighbours, then to those close to the first plane.
         slope_u, slope_v = 0.0, 0.0
-        for attempt in range(2):  # through all neighbours, then through those close to that plane
+        for attempt in range(2):
             uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0  # sums of products
-            num, num_close = 0, 0
+            num_neighbours, num_fitted = 0, 0
             for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
                 for c in range(column - reach, column + reach + 1):
-                    j = cells[r, c % num_columns]
+                    j = cells[r, c % num_columns]  # columns wrap around
                     if j < 0:
                         continue
                     u = spherical[0, j] - spherical[0, i]
@@ -285,16 +286,18 @@ def _fit_unordered(first, last, rows, spherical, table, grid, cells, normal, spa
                     v, w = spherical[1, j] - spherical[1, i], 1 / spherical[2, j] - 1 / range_m
                     if u == 0 and v == 0 and w == 0:
                         continue  # the point itself, or one at the same position
-                    num += 1
+                    num_neighbours += 1
+                    # A difference of inverse range (1/m), times range², is one of range (m).
                     deviation_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
                     if attempt and deviation_m > AGREE_M + _BEND * abs(w) * range_m * range_m:
                         continue
-                    num_close += 1
+                    num_fitted += 1
                     uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
             ridge = _RIDGE * (uu + vv) + 1e-12  # not singular, even with one neighbour
             slope_u, slope_v = slopes(uu + ridge, uv, vv + ridge, uw, vw)
-            if 2 * num_close < num:  # no plane: the patch faces the scanner
+            if 2 * num_fitted < num_neighbours:  # no single plane: the patch faces the scanner
                 slope_u, slope_v = 0.0, 0.0
+        # From the sphere to a slope per radian of azimuth, which is shorter there
         _put(i, spherical, table, slope_u * shortening, slope_v, normal, spacing)
 
 
@@ -307,8 +310,7 @@ def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
     paint(points.uv, points.inverse, points.slope, half_px, nearest)
     with np.errstate(divide="ignore"):
         nearest_m = 1 / nearest[pixel_of(points.uv)].astype(np.float64)  # inf without a patch
-    occluded: Bool = points.depth - nearest_m > hidden_m(nearest_m)
-    return occluded
+    return points.depth - nearest_m > hidden_m(nearest_m)
 
 
 @Kernel
@@ -387,7 +389,10 @@ def _by_pixel(pixel, rank, depth, frame, uv, start, order):  # type: ignore[no-u
 
 @inlined
 def limit_inverse(inverse, start):  # type: ignore[no-untyped-def]
-    """Return inverse depth ``inverse``, kept between 1 / 1.4 and 1.4 times ``start``."""
+    """Return ``inverse`` (1/m), kept between 1 / 1.4 and 1.4 times ``start`` (1/m, above 0).
+
+    ``inverse`` is extended from a pixel with the inverse depth ``start``, and may be 0 or below.
+    """
     return min(max(inverse, start / _MOST_RATIO), _MOST_RATIO * start)
 
 

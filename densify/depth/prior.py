@@ -234,8 +234,7 @@ def _correction(
         diagonal = np.bincount(cell, weight, num_cells) / area + _TOWARDS_NONE
         pull = np.bincount(cell, weight * values, num_cells) / area + _TOWARDS_NONE * elsewhere
         system = (membrane + sparse.diags_array(diagonal)).tocsc()
-        solution: Float = linalg.spsolve(system, pull, permc_spec="MMD_AT_PLUS_A")
-        return solution
+        return linalg.spsolve(system, pull, permc_spec="MMD_AT_PLUS_A")
 
     # A steep prior may be blurred. Differences there have little weight.
     flatness_weight = _robust_weight(steepness[pulls])
@@ -254,5 +253,4 @@ def _correction(
 
 def _robust_weight(deviation: Float | Float32) -> Float:
     """Return the (N,) weights of pixels with these deviations in the logarithm of depth."""
-    weight: Float = 1 / (1 + (deviation.astype(np.float64) / (2 * _USUAL)) ** 2)
-    return weight
+    return 1 / (1 + (deviation.astype(np.float64) / (2 * _USUAL)) ** 2)

@@ -194,8 +194,7 @@ def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure:
         uv = sight.uv
         is_valid = is_valid & sight.inside
     crosses = is_valid & is_same & (end_m - depth_m > hidden_m(depth_m))
-    crossings_uv: Float = uv[crosses]
-    return crossings_uv
+    return uv[crosses]
 
 
 def _share_at_depth(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
@@ -206,8 +205,7 @@ def _share_at_depth(start: Float, end: Float, depth_m: Float, measure: str) -> F
     path = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
         if measure == "z":
-            share: Float = (depth_m - start[:, 2]) / path[:, 2]
-            return share
+            return (depth_m - start[:, 2]) / path[:, 2]
         # The farther solution of |start + share · path|² = depth²
         length_squared = (path**2).sum(axis=1)
         start_along_path = (start * path).sum(axis=1)

@@ -83,8 +83,7 @@ def _scanner_origins(sweep: Sweep) -> Float:
 def _find_returns(sweep: Sweep, numbers: Int) -> Int:
     """Return the (K,) indices in a sweep of the returns with these numbers in the recording."""
     order = np.argsort(sweep.row, kind="stable")
-    returns: Int = order[np.searchsorted(sweep.row, numbers, sorter=order)]
-    return returns
+    return order[np.searchsorted(sweep.row, numbers, sorter=order)]
 
 
 def half_spaces(corners: Float) -> Float:
@@ -118,13 +117,12 @@ def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float,
 
 
 def passes_near(corners: Float, start: Float, direction: Float) -> Bool:
-    """Return (K,) True for lines of `find_crossing` that meet a sphere around corners (V,3)."""
+    """Return (K,) True for lines as in `find_crossing` that meet a sphere around corners (V,3)."""
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
     # The distance of a line from the middle, times the length of its direction
     scaled_m = np.linalg.norm(np.cross(start - middle, direction), axis=1)
-    passes: Bool = scaled_m <= radius_m * np.linalg.norm(direction, axis=1)
-    return passes
+    return scaled_m <= radius_m * np.linalg.norm(direction, axis=1)
 
 
 class ObjectRays(NamedTuple):
@@ -213,8 +211,7 @@ def _may_meet(xy: Float32, bound_m: float, corners: Float) -> Bool:
     tangent = np.float32(radius_m / np.sqrt(range_m**2 - radius_m**2))  # of half its angle
     forward_m = axis_x * xy[0] + axis_y * xy[1]
     sideways_m = axis_y * xy[0] - axis_x * xy[1]
-    may_meet: Bool = (forward_m > range_m - radius_m) & (abs(sideways_m) <= tangent * forward_m)
-    return may_meet
+    return (forward_m > range_m - radius_m) & (abs(sideways_m) <= tangent * forward_m)
 
 
 class MovingBody(NamedTuple):
@@ -262,7 +259,10 @@ def find_moving_bodies(
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies that still span a volume without the points and rays of a sweep."""
+    """Return the bodies without a sweep's rays, if they still span a volume without its points.
+
+    ``cloud`` holds the points of the other sweeps; ``frame`` is the number of the sweep left out.
+    """
     reduced_bodies = {}
     for instance, body in bodies.items():
         corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
@@ -303,7 +303,10 @@ def _body(
 def complete_boxes(
     tracks: Sequence[ObjectTrack], cloud: Cloud, rays: Rays, ground: HeightMap
 ) -> tuple[ObjectTrack, ...]:
-    """Return the tracks with completed boxes, and with the sides that were seen.
+    """Return the tracks with completed boxes, and in ``sides_seen`` the sides that were seen.
+
+    Where no ray shows free space a box grows to the usual size of a vehicle, and to the ground. A
+    side is seen if free space begins within 0.4 m of it. The bottom is never named.
 
     Args:
         tracks: The tracked objects, with boxes around their points.
@@ -358,8 +361,7 @@ def _reach_corners(track: ObjectTrack, key: int) -> Float:
 def corners_of(size_m: Float) -> Float:
     """Return the (8,3) corners, bottom and top in turn, of a box of (3,) m around the origin."""
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1)
-    corners: Float = signs.reshape(-1, 3) * size_m / 2
-    return corners
+    return signs.reshape(-1, 3) * size_m / 2
 
 
 def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectTrack:
@@ -376,7 +378,8 @@ def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectT
     for axis, sides in enumerate(_SIDES):
         # At the lower and at the upper end of the axis. The rays are in the frame of the first box.
         free_m = [
-            _free_m(track.size_m, missing_m, axis, sign, start, to_return) for sign in (-1, 1)
+            _distance_to_free_space_m(track.size_m, missing_m, axis, sign, start, to_return)
+            for sign in (-1, 1)
         ]
         is_seen = [end_m <= _BESIDE_M for end_m in free_m]
         sides_seen += [side for side, seen in zip(sides, is_seen, strict=True) if seen]
@@ -397,7 +400,7 @@ def _share_growth(missing_m: float, room_m: Sequence[float]) -> list[float]:
     return [min(end_m, part + rest_m) for end_m, part in zip(room_m, part_m, strict=True)]
 
 
-def _free_m(
+def _distance_to_free_space_m(
     size_m: Float, missing_m: Float, axis: int, sign: int, start: Float, to_return: Float
 ) -> float:
     """Return the metres from a side of a box to the nearest free space outside; inf for none.
@@ -405,7 +408,8 @@ def _free_m(
     The side is at the lower (``sign`` -1) or upper (1) end of ``axis``. Free space is where three
     rays (K,3), in the frame of the box, pass. It is looked for up to where the box may grow.
     """
-    # The space outside the flat part of the side; vertical sides are tested below the windows.
+    # The searched space, from low to high: from the side outwards, and beside its flat part only;
+    # vertical sides are tested below the windows.
     low, high = -_MIDDLE * size_m / 2, _MIDDLE * size_m / 2
     if axis < 2:
         low[2], high[2] = -size_m[2] / 2 + np.array(_BODY) * size_m[2]
@@ -413,14 +417,15 @@ def _free_m(
     side_m = sign * size_m[axis] / 2
     low[axis], high[axis] = sorted([side_m, side_m + sign * reach_m])
 
-    # Each ray crosses the space from its origin or entry to its return or exit.
+    # Each ray crosses the space from its origin (0) or entry to its return (1) or exit.
     enter, leave = find_crossing(_box_spaces(low, high), start, to_return)
     enter, leave = np.maximum(enter, 0), np.minimum(leave, 1)
     crosses = enter < leave
     start_m, ray_m = start[crosses, axis], to_return[crosses, axis]
     ends_m = np.stack([start_m + enter[crosses] * ray_m, start_m + leave[crosses] * ray_m])
-    distance_m = np.sort(np.min(sign * ends_m, axis=0) - abs(side_m))  # of each ray's nearer end
-    return float(distance_m[_NUM_RAYS - 1]) if len(distance_m) >= _NUM_RAYS else np.inf
+    # A ray shows free space from the end of this part that is nearer to the side.
+    nearer_m = np.sort(np.min(sign * ends_m, axis=0) - abs(side_m))
+    return float(nearer_m[_NUM_RAYS - 1]) if len(nearer_m) >= _NUM_RAYS else np.inf
 
 
 def _box_spaces(low: Float, high: Float) -> Float:
@@ -429,7 +434,10 @@ def _box_spaces(low: Float, high: Float) -> Float:
 
 
 def grow_box(track: ObjectTrack, axis: int, before_m: float, after_m: float) -> ObjectTrack:
-    """Return the track, its box longer along ``axis`` by metres at its lower and upper end."""
+    """Return the track, its box longer along an axis (0, 1 or 2) of the object's frame.
+
+    It grows by ``before_m`` at the lower and ``after_m`` at the upper end of the axis.
+    """
     size_m, T_key_object = track.size_m.copy(), track.T_key_object.copy()
     size_m[axis] += before_m + after_m
     shift_m = (after_m - before_m) / 2

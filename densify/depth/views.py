@@ -71,16 +71,16 @@ class SeenCloud(NamedTuple):
 
 @dataclass(frozen=True)
 class Views:
-    """The cameras and times of the depth maps of a key sweep; mappings are by name of the map."""
+    """The cameras and times of the depth maps of a key sweep."""
 
     key: int  # frame number of the key sweep
-    exposures: Mapping[str, Exposure]  # camera and time of each map
-    sensors: Sensors
-    # (S,3) origins of the scanners in the key sweep's lidar frame, by frame number of the sweep
+    exposures: Mapping[str, Exposure]  # name of a map -> its camera and time
+    sensors: Sensors  # scanners of the recording
+    # Frame number of a sweep in the window -> (S,3) origins of its scanners, key's lidar frame
     origins: Mapping[int, Float]
     rays: Rays  # rays of the window's sweeps
-    settings: ProjectSettings
-    lab: Mapping[str, Float32]  # (H,W,3) L*a*b* images of the maps that use an image
+    settings: ProjectSettings  # section ``project`` of the configuration
+    lab: Mapping[str, Float32]  # name of a map that uses an image -> (H,W,3) image in L*a*b*
     # Names of the maps whose image edges do not lie on the depth discontinuities
     misaligned_maps: frozenset[str] = frozenset()
 
@@ -150,7 +150,7 @@ class Views:
     def see_far(
         self, world: StaticWorld, T_key_world: Float, stretch: Stretch, static_only: bool
     ) -> SeenCloud:
-        """Return the points of sweeps beyond the window as cameras see them, see `far_cloud`."""
+        """Return the points of sweeps beyond the window as cameras see them; see `far_cloud`."""
         cloud, surface = far_cloud(
             world, T_key_world, stretch, self.key, self.exposures, static_only
         )
@@ -159,7 +159,11 @@ class Views:
     def depth_maps(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
     ) -> dict[str, DepthMap]:
-        """Return each view's depth map by name, of ``visible`` points, ``filled`` in between."""
+        """Return each view's depth map, by name.
+
+        Unless ``visible``, pixels take their nearest point, without occlusion or rejection. Unless
+        ``filled``, pixels without a return stay empty.
+        """
         settings = replace(self.settings, visibility=visible)
         depth_maps = {}
         for name, view in seen.in_view.items():
@@ -249,7 +253,10 @@ class Views:
     def optical_flow(
         self, cloud: Cloud, depth_maps: Mapping[str, DepthMap]
     ) -> dict[str, dict[str, Float32]]:
-        """Return the (H,W,2) `optical_flow` to the "previous" and "next" image, by map name."""
+        """Return name of the map -> "previous" or "next" -> (H,W,2) flow to that image in px.
+
+        Images outside the window have no entry, see `optical_flow`.
+        """
         return {
             name: {
                 image: optical_flow(cloud, depth_maps[name], exposure, neighbour)
@@ -324,7 +331,8 @@ def optical_flow(
     """Return the (H,W,2) flow in pixels, right and down, between two exposures; NaN if unknown.
 
     It includes ego-motion; moving objects keep their velocity. Pixels under a laser spot take the
-    flow of the nearest measured pixel, other filled pixels have none.
+    flow of the nearest pixel with a point, other filled pixels have none. ``depth_map`` is that of
+    the cloud at ``exposure``, where the flow starts.
     """
     chosen = np.flatnonzero(depth_map.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
@@ -378,14 +386,13 @@ class HeldOut:
     """The key sweep's returns as ground truth for maps made from its neighbouring sweeps alone."""
 
     views: Views
-    # Depth maps of the key sweep by name, without boundary pixels
-    key_alone: Mapping[str, DepthMap]
-    moving: Mapping[str, Bool]  # (H,W) True at moving returns of the key sweep, by name of the map
+    key_alone: Mapping[str, DepthMap]  # name -> map of the key sweep, without boundary pixels
+    moving: Mapping[str, Bool]  # name of a map -> (H,W) True at moving returns of the key sweep
     gap_rad: float  # usual angle between neighbouring rings of the key sweep
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """Return the ground truth of a key sweep; ``cloud`` has velocities of moving points."""
+        """Return the ground truth of a key sweep from the window's cloud, with its velocities."""
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
         seen = views.see(key_cloud)
@@ -415,7 +422,7 @@ class HeldOut:
         return SeenCloud(cloud, seen.patches.select(keep), in_view, bodies)
 
     def judged_maps(self, seen: SeenCloud, visible: bool) -> dict[str, JudgedMap]:
-        """Return each map made without the key sweep with its truth, by name; {} without points."""
+        """Return each map of a cloud without the key sweep, by name; {} if no points remain."""
         neighbours_only = self.without_key(seen)
         if not len(neighbours_only.cloud):
             return {}
@@ -432,8 +439,9 @@ class HeldOut:
     def scores(self, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
         """Return the scores of each map made without the key sweep, None if no points remain.
 
-        Besides `depth_scores` these are ``curve`` (precision over density), ``reliability``, and
-        ``unjudged``, the filled share without a key return within a ray spacing.
+        The keys are names of maps, then those of `depth_scores`, ``curve`` (precision by density),
+        ``reliability``, and ``unjudged``: the shares of ``all``, ``moving`` and ``static`` filled
+        pixels without a key return within a ray spacing.
         """
         scores: dict[str, Any] = {}
         for name, judged in self.judged_maps(seen, visible).items():

@@ -33,6 +33,8 @@ _STRIDE = 3.0  # number of compared colours per spacing of rays, on the path to 
 # all beyond edges of the image, and weigh almost nothing, would decide.
 _DOUBT = 0.04
 _SHIFT = 0.6  # tested shift of the image, in spacings of neighbouring rays
+# Tested shifts to the right and down, in units of `_SHIFT`: none, and one to each side
+_SHIFTS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
 ROUNDED = 1 - 1e-6
 """Factor of a least share of votes, for rounding errors of the sums."""
 
@@ -77,20 +79,22 @@ def _march(steps):  # type: ignore[no-untyped-def]
     # the direction, so that these are computed before.
     height, width = steps.shape[1:]
     for d in range(len(DIRECTIONS)):
-        u1, v1, u2, v2 = DIRECTIONS[d].ravel()
+        u1, v1, u2, v2 = DIRECTIONS[d].ravel()  # columns and rows after one step, after two steps
         for i in range(2, height - 2):
             row = height - 1 - i if v2 > 0 else i
-            line = steps[d, row, 2 : width - 2]
-            if v2 == 0:  # along the row all steps are equal, and one pixel follows from the next
+            line = steps[d, row, 2 : width - 2]  # the pixels without the border
+            if v2 == 0:
+                # Horizontally all steps are equal: a pixel is one step farther than the next.
                 for j in range(len(line)):
                     column = len(line) - 1 - j if u2 > 0 else j
                     next_steps = steps[d, row, 2 + column + u1]
                     line[column] = 0 if line[column] == 0 else min(next_steps, 254) + 1
                 continue
+            # 0 steps if known, 1 if the pixel one step on is, else two more than the pixel two on.
+            # A sum above 255 (NONE) would overflow.
             after_one = steps[d, row + v1, 2 + u1 : width - 2 + u1]
             after_two = steps[d, row + v2, 2 + u2 : width - 2 + u2]
             for j in range(len(line)):
-                # A sum above 254 would overflow: NONE is 255.
                 farther = min(after_two[j], np.uint8(253)) + np.uint8(2)
                 farther = np.uint8(1) if after_one[j] == 0 else np.uint8(farther)
                 line[j] = np.uint8(0) if line[j] == 0 else farther
@@ -98,7 +102,7 @@ def _march(steps):  # type: ignore[no-untyped-def]
 
 @inlined
 def offset(d, k):  # type: ignore[no-untyped-def]
-    """Return the offset in columns and rows after k steps in direction d."""
+    """Return the offset in columns and rows after k steps in direction d of `DIRECTIONS`."""
     du = (k // 2) * DIRECTIONS[d, 1, 0] + (k % 2) * DIRECTIONS[d, 0, 0]
     dv = (k // 2) * DIRECTIONS[d, 1, 1] + (k % 2) * DIRECTIONS[d, 0, 1]
     return du, dv
@@ -106,12 +110,14 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 
 @inlined
 def extend(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Return the inverse depth (1/m) of the surface of pixel (v, u), extended to (v - dv, u - du).
+    """Return the inverse depth (1/m) at pixel (v - dv, u - du) of the surface of pixel (v, u).
 
-    ``inverse`` (H,W) is in 1/m, ``tilt`` (H,W,2) its slope right and down in 1/m per px.
+    ``inverse`` (H,W) holds inverse depths in 1/m, ``tilt`` (H,W,2) their slopes to the right and
+    down in 1/m per px. v and dv count rows, u and du columns.
     """
-    known = inverse[v, u]
-    return limit_inverse(known - tilt[v, u, 0] * du - tilt[v, u, 1] * dv, known)
+    at_start = inverse[v, u]
+    on_plane = at_start - tilt[v, u, 0] * du - tilt[v, u, 1] * dv
+    return limit_inverse(on_plane, at_start)
 
 
 class Voters(NamedTuple):
@@ -132,8 +138,9 @@ def votes_for(
 ) -> Float32:
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
-    A known pixel votes for the depth if its own surface, extended to the pixel, has that depth.
-    Otherwise it votes against. Edges of the image weaken votes.
+    The first known pixel in each of 16 directions votes, up to 6 ray spacings away. It votes for
+    the depth if its own surface, extended to the pixel, has that depth to 0.2 m and 6 %, otherwise
+    against. Edges of the image, and distance, weaken votes.
 
     Args:
         record: Record with the image, the slopes and the spacing of rays.
@@ -152,8 +159,7 @@ def votes_for(
     for map_m, share in zip(maps_m, shares, strict=True):
         voters = Voters(steps_to_known(map_m > 0), inverse_of(map_m), tilt)
         _vote.over_rows(len(pixel), pixel, inverse, voters, colours, gap_px, with_shifts, share)
-    least_share: Float32 = shares.min(axis=0)
-    return least_share
+    return shares.min(axis=0)
 
 
 @inlined
@@ -161,7 +167,8 @@ def _steps_to_other(steps, d, v, u):  # type: ignore[no-untyped-def]
     """Return the steps in direction d from row v, column u to another known pixel, or `NONE`."""
     num_steps = np.int64(steps[d, v, u])
     height, width = steps.shape[1:]
-    # A known pixel is 0 steps from itself: the pixels one and two steps on tell. No iteration else.
+    # A known pixel is 0 steps from itself, and the pixels one and two steps on decide. For other
+    # pixels the loop is empty.
     for k in range(1, 3 if num_steps == 0 else 1):
         du, dv = offset(d, k)
         if not (0 <= u + du < width and 0 <= v + dv < height):
@@ -174,7 +181,7 @@ def _steps_to_other(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _cast_votes(voters, v, u, depth_m, gap_px, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in ``steps`` (16,) to the voters (0: none) and ``agrees`` (16,); count for, against."""
+    """Fill in ``steps`` (16,) to the voters (0: none) and ``agrees`` (16,); count both votes."""
     tolerance_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
     num_for, num_against = 0, 0
     for d in range(len(steps)):
@@ -215,7 +222,7 @@ def _colour_weight(lab, v, u, d, k, gap_px):  # type: ignore[no-untyped-def]
 
 @Kernel
 def _vote(first, last, pixel, inverse, voters, lab, gap_px, with_shifts, share):  # type: ignore[no-untyped-def]
-    """Fill ``share`` (P,), the result of `votes_for` on inverse depths ``inverse`` (P,) in 1/m."""
+    """Fill ``share`` (P,) with the share of the votes for inverse depths ``inverse`` (P,), 1/m."""
     width, num_directions = gap_px.shape[1], len(DIRECTIONS)
     steps, agrees = np.empty(num_directions, np.int64), np.empty(num_directions, np.bool_)
     doubt = _DOUBT if with_shifts else 0.0
@@ -224,18 +231,17 @@ def _vote(first, last, pixel, inverse, voters, lab, gap_px, with_shifts, share):
         gap = gap_px[v, u]
         num_for, num_against = _cast_votes(voters, v, u, 1 / inverse[i], gap, steps, agrees)
         if not with_shifts and (num_for == 0 or num_against == 0):
-            share[i] = num_for > 0  # all votes are equal, or there is none
+            share[i] = num_for > 0  # all votes are equal, whatever they weigh, or there is none
             continue
+        # The least share of all positions of the image. A shift of 0 px would repeat the first.
         shift_px = np.int64(np.rint(_SHIFT * gap)) if with_shifts else 0
         least_share = 1.0
-        # Colours at the pixel, then to the right, left, below and above
-        for side in range(5 if shift_px else 1):
-            down = shift_px * ((side == 3) - (side == 4))
-            right = shift_px * ((side == 1) - (side == 2))
+        for side in range(len(_SHIFTS) if shift_px else 1):
+            right, down = shift_px * _SHIFTS[side, 0], shift_px * _SHIFTS[side, 1]
             sum_for, sum_all = 0.5 * doubt, doubt  # half of the constant vote is for the depth
             for d in range(num_directions):
                 k = steps[d]
-                if k == 0:
+                if k == 0:  # no voter in this direction
                     continue
                 colour_weight = _colour_weight(lab, v + down, u + right, d, k, gap)
                 weight = colour_weight / (1 + k / (_DECAY * gap))

@@ -13,7 +13,9 @@ from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
 _NUM_NEIGHBORS = 3  # points whose deviations are averaged
-_LINE_M = 0.05  # points with less scatter about a line count as on the line
+# Singular value (m, the root of the sum of squares) of the scatter across a line, below which
+# points count as on the line: they do not determine a rotation about it.
+_LINE_M = 0.05
 _MAX_GAP_M = 0.5  # greatest distance to a moving point that continues a flow
 
 
@@ -30,10 +32,13 @@ class ChainedMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
-        It excludes ego-motion, in the lidar frame of ``frame``. At each sweep on the way, points of
-        an object take its rigid motion plus the mean deviation of the nearest points, others the
-        mean flow of the nearest moving points. A point is lost if its object has no points in the
-        next sweep, or if no moving point is within 0.5 m.
+        It excludes ego-motion, and is in the lidar frame of ``frame``. At each sweep on the way,
+        points of an object take its rigid motion plus the mean deviation of the nearest three
+        points. Moving points without an object take the mean flow of the nearest three. A point is
+        lost if its object has no points in the next sweep, or, without an object, if the nearest
+        such point is more than 0.5 m away.
+
+        The flow to ``frame`` itself is 0, with the labels of the step to a neighbouring sweep.
         """
         i = self.stretch.frames.index(frame)
         j = self.stretch.frames.index(target)
@@ -65,43 +70,48 @@ class ChainedMotion:
         velocity_m_s = step.displacement / ((stamp_j_ns - stamp_i_ns) * 1e-9)
         return replace(step, velocity_m_s=velocity_m_s)
 
-    def _follow(self, i: int, k: int, flow_k: FlowField) -> FlowField:
-        """Chain the flow of sweep i to its neighbour k with ``flow_k``, from k to the target."""
-        step = self._flow(i, k)
-        sweep_i, sweep_k = self.stretch.sweeps[i], self.stretch.sweeps[k]
-        T_k_i = self.stretch.T_target_source(sweep_k.frame, sweep_i.frame)
-        R_k_i = T_k_i[:3, :3]
+    def _follow(self, i: int, neighbour: int, onward: FlowField) -> FlowField:
+        """Chain the flow of sweep i to its neighbour with ``onward``, from there to the target."""
+        step = self._flow(i, neighbour)
+        sweep, next_sweep = self.stretch.sweeps[i], self.stretch.sweeps[neighbour]
+        T_next_lidar = self.stretch.T_target_source(next_sweep.frame, sweep.frame)
+        R_next_lidar = T_next_lidar[:3, :3]
         displacement = step.displacement.copy()
         lost = step.lost.copy()
         velocity_m_s = np.zeros_like(displacement)
-        # (N,3) points of sweep k at its reference time: ``total`` also moves them to the target
-        points_k = sweep_k.sweep.points + flow_k.total - flow_k.displacement
+        # (M,3) points of the neighbour at its reference time. The total flow is the motion to this
+        # time plus the displacement to the target.
+        next_points = next_sweep.sweep.points + onward.total - onward.displacement
         for instance in np.unique(step.instance[step.moving]):
             rows = np.flatnonzero(step.moving & (step.instance == instance))
-            rows_k = np.flatnonzero(flow_k.moving & ~flow_k.lost & (flow_k.instance == instance))
-            if not len(rows_k):
+            next_rows = np.flatnonzero(onward.moving & ~onward.lost & (onward.instance == instance))
+            if not len(next_rows):
                 lost[rows] = True
                 continue
-            # Where the step brings the points of sweep i, and the object's nearest points there
-            arrived = poses.transform(T_k_i, sweep_i.sweep.points[rows] + step.total[rows])
-            members_k = points_k[rows_k]
-            gap_m, nearest = nearest_k(tree_of(members_k), arrived, _NUM_NEIGHBORS)
+            # Where the step brings the points of sweep i, and the object's points around there
+            arrived = poses.transform(T_next_lidar, sweep.sweep.points[rows] + step.total[rows])
+            members = next_points[next_rows]
+            gap_m, nearest = nearest_k(tree_of(members), arrived, _NUM_NEIGHBORS)
             weight = 1 / (gap_m + 1e-3)  # 1 mm avoids a division by 0
             weight /= weight.sum(axis=1, keepdims=True)
-            # Their motion from sweep k on: rigid, plus what the nearest points deviate from it
             if instance >= 0:
-                target = members_k + flow_k.displacement[rows_k]
-                T = _object_motion(members_k, target)
+                # A point moves on with the rigid motion of its object, plus the mean deviation of
+                # the points around it from this motion.
+                member_targets = members + onward.displacement[next_rows]
+                T = _object_motion(members, member_targets)
                 rigid_flow = poses.transform(T, arrived) - arrived
-                deviation = target - poses.transform(T, members_k)
-            else:  # instance -1: moving points without an object
+                deviation = member_targets - poses.transform(T, members)
+            else:
+                # Instance -1 holds moving points without an object. They need not move alike, so a
+                # point moves on with the mean of the points around it.
                 rigid_flow = np.zeros_like(arrived)
-                deviation = flow_k.displacement[rows_k]
+                deviation = onward.displacement[next_rows]
                 lost[rows[gap_m[:, 0] > _MAX_GAP_M]] = True
-            displacement[rows] += (rigid_flow + _mean(deviation, nearest, weight)) @ R_k_i
-            if flow_k.velocity_m_s is not None:
-                velocity_k_m_s = flow_k.velocity_m_s[rows_k]
-                velocity_m_s[rows] = _mean(velocity_k_m_s, nearest, weight) @ R_k_i
+            # From the axes of the neighbour to those of sweep i: row vectors times R turn back.
+            displacement[rows] += (rigid_flow + _mean(deviation, nearest, weight)) @ R_next_lidar
+            if onward.velocity_m_s is not None:
+                next_velocity_m_s = onward.velocity_m_s[next_rows]
+                velocity_m_s[rows] = _mean(next_velocity_m_s, nearest, weight) @ R_next_lidar
         return replace(step, displacement=displacement, lost=lost, velocity_m_s=velocity_m_s)
 
 

@@ -32,7 +32,7 @@ class Scene:
 
     @cached_property
     def candidates(self) -> tuple[Candidates, ...]:
-        """The points above the ground of each sweep, and which may move, see `find_candidates`."""
+        """For each sweep, its points above the ground and which of them may move."""
         return find_candidates(self.stretch, self.space, self.ground)
 
     def is_asked(self, i: int) -> bool:
@@ -46,36 +46,46 @@ class SharedMotion(Motion, Protocol):
     # A dataclass, which the disk cache stores without the points of its sweeps
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
-        """Return the same motion on a new copy of its stretch, an empty one for the disk cache."""
+        """Return the same motion on another copy of its stretch; that on disk has no points."""
         ...
 
 
 class EngineModule(Protocol):
-    """The functions of an engine's module, perhaps with ``check_argument(argument: str) -> None``.
+    """The functions of an engine's module.
 
-    It is called before anything is computed, and raises InputError for a bad argument.
+    A module may also have ``check_argument(argument: str) -> None``. It is called before anything
+    is computed, and raises InputError for a bad argument.
     """
 
     def estimate_motion(self, scene: Scene, settings: Config, argument: str) -> Motion:
         """Return the motion of all points in the scene; the same input gives the same bytes.
 
-        ``argument`` is what follows the colon in ``flow.engine``, or "". Work may wait until the
-        motion's ``flow`` is called. An engine that its plugin row calls ``shared`` returns a
-        `SharedMotion`.
+        ``argument`` is the text after the colon in ``flow.engine``, "" without a colon. Work may
+        wait until the motion's ``flow`` is called. An engine that is registered as ``shared``
+        returns a `SharedMotion`.
         """
         ...
 
 
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
-    """Return the motion of a scene by the engine ``NAME[:ARGUMENT]``; None for ``flow.engine``."""
-    row, argument = engine(spec or settings.flow.engine)
-    module = cast(EngineModule, row.load_module())
+    """Return the motion of all points in a scene, by one scene flow engine.
+
+    Args:
+        scene: Registered sweeps, their ground and free space.
+        settings: Configuration of the run.
+        spec: Engine as ``NAME`` or ``NAME:ARGUMENT``, such as ``groups``; None for ``flow.engine``.
+
+    Raises:
+        InputError: No engine has this name, or the engine rejects its argument.
+    """
+    plugin, argument = engine(spec or settings.flow.engine)
+    module = cast(EngineModule, plugin.load_module())
     return module.estimate_motion(scene, settings, argument)
 
 
 def check_engine(spec: str) -> None:
     """Import an engine ``NAME[:ARGUMENT]`` and check its argument; InputError if it is bad."""
-    row, argument = engine(spec)
-    check = getattr(row.load_module(), "check_argument", None)
+    plugin, argument = engine(spec)
+    check = getattr(plugin.load_module(), "check_argument", None)
     if check is not None:
         check(argument)

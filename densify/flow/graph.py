@@ -16,7 +16,11 @@ from densify.geometry.types import Float
 
 
 def checked_cloud(values: ArrayLike, name: str) -> Float:
-    """Return a copy of a cloud as (n,3) float64 metres."""
+    """Return a copy of a cloud, (n,3) numbers, as float64 metres; ``name`` is for messages.
+
+    Raises:
+        InputError: The values are no numbers, have another shape, are empty or not finite.
+    """
     try:
         points = np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
@@ -35,11 +39,18 @@ def checked_cloud(values: ArrayLike, name: str) -> Float:
 
 
 def knn_graph(points: Float, num_neighbors: int) -> csr_array:
-    """Return the weights W of the undirected k-nearest-neighbour graph of points (n,3), metres.
+    """Return the weights W of the undirected graph of nearest neighbours.
 
     W is (n,n) symmetric float64, with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is
-    among the k nearest of the other, itself excluded, 1 on the diagonal, 0 elsewhere; k is at most
-    n - 1. A larger k couples the flow of points farther apart.
+    among the k nearest of the other, 1 on the diagonal, 0 elsewhere.
+
+    Args:
+        points: (n,3) metres.
+        num_neighbors: k, itself excluded. At most n - 1 are used. A larger k couples the flow of
+            points farther apart.
+
+    Raises:
+        InputError: k is below 1, or the points are no cloud, see `checked_cloud`.
     """
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
@@ -59,10 +70,11 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
 
 
 def laplacian(weights: csr_array) -> csr_array:
-    """Return the (n,n) graph Laplacian ``L = D^-1/2 (D - W) D^-1/2`` of the W of `knn_graph`.
+    """Return the graph Laplacian ``L = D^-1/2 (D - W) D^-1/2``.
 
-    L is symmetric, positive semi-definite, float64. D holds the row sums of W with ``W_ii = 1``, as
-    in the paper. The null space is ``D^1/2 · 1``: constant flow costs energy where density changes.
+    L is (n,n) symmetric, positive semi-definite float64. D holds the row sums of the (n,n)
+    ``weights`` W of `knn_graph`, with ``W_ii = 1`` as in the paper. The null space of L is
+    ``D^1/2 · 1``: constant flow costs energy where density changes.
     """
     degree = weights.sum(axis=1)
     scale = diags_array(1.0 / np.sqrt(degree))

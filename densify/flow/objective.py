@@ -77,14 +77,16 @@ def solve(
     settings: SolverSettings | None = None,
     initial: ArrayLike | None = None,
 ) -> Solution:
-    """Return the smooth flow that moves ``source`` onto ``target``, a minimum of the objective.
+    """Return the smooth flow that moves ``source`` onto ``target``, a local minimum.
 
     All is computed in float64. The same input gives the same bytes on the same CPU.
 
     Args:
         source: (n,3) metres.
         target: (m,3) metres, in the same frame.
-        initial: (n,3) flow to start from, None for 0. With it, pcg uses the final alpha at once.
+        settings: Solver and its numbers; None for the defaults of `SolverSettings`.
+        initial: (n,3) flow in metres to start from, None for 0. With it, pcg uses the final alpha
+            at once.
 
     Raises:
         InputError: A shape does not fit, or a cloud is empty or not finite.
@@ -227,7 +229,7 @@ def _descending_alphas(first: float, alpha: float) -> list[float]:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion by the published objective, see `EngineModule`; takes no argument."""
+    """Return the motion by the published objective, above the ground; ``argument`` is not used."""
 
     def step(i: int, j: int) -> FlowField:
         return _sweep_flow(scene, i, j, settings)
@@ -257,9 +259,17 @@ def flow_between(
     settings: ObjectiveSettings,
     initial: ArrayLike | None = None,
 ) -> FlowField:
-    """Return the flow of a source (N,3) to a target (M,3), metres, by the published objective.
+    """Return the flow of one cloud to another by the published objective, in their common frame.
 
-    With ``static_prior`` only groups that certainly move have flow. See `densify.estimate_flow`.
+    Args:
+        source: (N,3) metres.
+        target: (M,3) metres, in the same frame.
+        settings: Settings of the solver. With ``static_prior`` only groups of points that certainly
+            move have flow, each as an instance. Without it every point moves, as instance -1.
+        initial: (N,3) flow to start from, metres; None starts from 0.
+
+    Raises:
+        InputError: A setting or a shape does not fit, or a cloud is empty or not finite.
     """
     objective = SolverSettings(
         solver=settings.solver,
@@ -275,21 +285,24 @@ def flow_between(
 
 def _keep_moving_groups(clouds: tuple[Float, Float], flow: Float) -> FlowField:
     """Keep the flow (N,3) of groups of points that certainly move; other points get flow 0."""
+    source_points, target_points = clouds
+    # The objective knows no firing times. All points of the source count as measured before the
+    # motion (share 0 of it), all points of the target after it (share 1).
+    source = PairCloud(source_points, share=np.zeros(len(source_points)))
+    target = PairCloud(target_points, share=np.ones(len(target_points)))
     field = FlowField.zero(len(flow))
-    source = PairCloud(clouds[0], np.zeros(len(clouds[0])))
-    target = PairCloud(clouds[1], np.ones(len(clouds[1])))
-    moved = np.flatnonzero(np.linalg.norm(flow, axis=1) > MIN_MOTION_M)
-    num_groups, group = link(source.points[moved], LINK_M)
-    instance = 0
+    long_flow = np.flatnonzero(np.linalg.norm(flow, axis=1) > MIN_MOTION_M)
+    num_groups, group = link(source_points[long_flow], LINK_M)
+    num_moving = 0
     for k in range(num_groups):
-        rows = moved[group == k]
+        members = long_flow[group == k]
         # A group is judged by its common translation: the flow of single points always brings them
         # closer to the target.
-        state = np.append(np.median(flow[rows], axis=0), 0.0)
-        motion = RigidMotion(state, source.points[rows].mean(0))
-        if judge(k, rows, motion, source, target).moves():
-            field.displacement[rows] = flow[rows]
-            field.moving[rows] = True
-            field.instance[rows] = instance
-            instance += 1
+        translation, no_yaw = np.median(flow[members], axis=0), 0.0
+        motion = RigidMotion(np.append(translation, no_yaw), source_points[members].mean(0))
+        if judge(k, members, motion, source, target).moves():
+            field.displacement[members] = flow[members]
+            field.moving[members] = True
+            field.instance[members] = num_moving
+            num_moving += 1
     return field

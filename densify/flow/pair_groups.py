@@ -76,9 +76,10 @@ class PairCloud:
 
 
 class Surface:
-    """The surfaces around the given points (M,3)."""
+    """Surfaces spanned by the points of a cloud, to which other points have a distance."""
 
     def __init__(self, points: Float) -> None:
+        """Index the points (M,3, metres) that span the surfaces."""
         self._points, self._tree = points, tree_of(points)
 
     def cost(self, points: Float) -> Float:
@@ -93,7 +94,7 @@ class Surface:
         on_surface = np.flatnonzero(exists.sum(axis=1) >= _MIN_NEIGHBORS)
         exists = exists[on_surface]
         neighbour = np.where(exists, np.asarray(neighbour)[on_surface], 0)
-        # Normal distribution of the neighbours that exist
+        # Normal distribution of the neighbours that exist; others have weight 0
         weight = exists / exists.sum(axis=1, keepdims=True)
         arms = self._points[neighbour]
         mean = np.einsum("nk,nki->ni", weight, arms)
@@ -121,10 +122,14 @@ def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
 
 
 def group_around(points: Float, unexplained: Bool) -> Int:
-    """Return (N,) labels of the groups of points (N,3) that may be moving, -1 for none.
+    """Return (N,) labels of the groups of points that may be moving, -1 for none.
 
-    Connected points form one group if no longer than a vehicle. In longer groups, such as walls,
-    only points close to ``unexplained`` (N,) points form groups.
+    Points linked by steps of up to 0.6 m form one group if it is no longer than a vehicle, 20 m. In
+    longer groups, such as walls, only points close to unexplained points form groups.
+
+    Args:
+        points: (N,3) metres.
+        unexplained: (N,) True for points without a counterpart in the other cloud.
     """
     num_groups, group = link(points, LINK_M)
     low = np.full((num_groups, 2), np.inf)
@@ -141,7 +146,10 @@ def group_around(points: Float, unexplained: Bool) -> Int:
 
 
 def find_road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
-    """Return the rows of each group that may be a road user, and not a treetop or a wall.
+    """Return the ascending rows of each group that may be a road user, not a treetop or a wall.
+
+    Such a group has at least 8 points, 5 of them unexplained. Its lowest points (5th percentile)
+    are at most 3.4 m high, its highest points (95th percentile) at most 6 m.
 
     Args:
         group: (N,) label of each point's group, -1 for none.
@@ -249,14 +257,14 @@ def judge(
     only the group moves: points that stay at its old position count against the motion.
 
     Args:
-        group: Index of the group.
-        members: (K,) rows of the group's source points.
+        group: Index of the group, which the proposal keeps.
+        members: (K,) rows of the group's source points, K >= 1.
         motion: Motion of the group that is judged.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.thin(members)
-    static_cost, static_rows = compare(source, members, target, static)
-    moved_cost, moved_rows = compare(source, members, target, motion)
+    static_cost, static_rows = cost_on_target(source, members, target, static)
+    moved_cost, moved_rows = cost_on_target(source, members, target, motion)
     rows = np.union1d(static_rows, moved_rows)
     points = target.points[rows]
     # If the group moves, a target point lies on the moved group or on the rest of the source.
@@ -275,30 +283,36 @@ def judge(
     )
 
 
-def compare(
+def cost_on_target(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Return how well source points fit the target's surfaces, moved back by a motion.
+    """Return how badly source points fit the surfaces of the target under a motion.
+
+    Both clouds are moved back to the source's reference time, each point from its own share of the
+    motion.
 
     Args:
-        members: (K,) rows of the source points.
+        members: (K,) rows of the compared source points, K >= 1.
 
     Returns:
-        The (K,) costs of the source points, and the indices of the target points that come close
-            to the source points when they are moved back.
+        cost: (K,) costs of the source points, 0 to 3, see `Surface.cost`.
+        rows: Indices of the thinned target points that, moved back, are in the box around the
+            source points or within 1 m of it.
     """
-    # The target fires over some time. The box holds the group at its first and last firing time.
-    points = motion.at_start(source, members)
-    positions = [motion.place(points, share) for share in (target.share.min(), target.share.max())]
+    members_at_start = motion.at_start(source, members)
+    # Target points are measured over some time. Only those can fit that lie around the group at the
+    # first or at the last of these times.
+    ends = target.share.min(), target.share.max()
+    positions = [motion.place(members_at_start, share) for share in ends]
     rows = target.rows_around(np.concatenate(positions))
-    target_points = motion.at_start(target, rows)
-    is_close = _in_box(target_points, points, SURFACE_M)
-    return Surface(target_points[is_close]).cost(points), rows[is_close]
+    target_at_start = motion.at_start(target, rows)
+    is_close = _in_box(target_at_start, members_at_start, SURFACE_M)
+    return Surface(target_at_start[is_close]).cost(members_at_start), rows[is_close]
 
 
 @dataclass(frozen=True)
 class Search:
-    """Search for motions of groups of source points."""
+    """Search for the motions of groups of source points; see `find_movers` for the arguments."""
 
     source: PairCloud  # points above the ground
     target: PairCloud  # points of the other cloud above the ground
@@ -311,6 +325,8 @@ class Search:
     def proposals(self, group: int, members: Int) -> list[Proposal]:
         """Return the motions that both clouds clearly support for a group, with their evidence.
 
+        Motions below 0.1 m or along a wall or a rail are left out. The list may be empty.
+
         Args:
             group: Index of the group.
             members: (K,) rows of the group's source points.
@@ -321,8 +337,9 @@ class Search:
         limit_m = reach_m
         displacements = []  # (3,) each, from which the group is aligned
         if self.initial is not None:
-            displacements = [np.median(self.initial[members], axis=0)]
-            limit_m = max(reach_m, float(np.linalg.norm(displacements[0])) + _APART_M)
+            initial_m = np.median(self.initial[members], axis=0)
+            displacements.append(initial_m)
+            limit_m = max(reach_m, float(np.linalg.norm(initial_m)) + _APART_M)
         room_m = np.array([limit_m, limit_m, 0.0]) + LINK_M
         rows = self.target.strips.rows_inside(points.min(0) - room_m, points.max(0) + room_m)
         rows = rows[self.movable[rows]]
@@ -332,7 +349,7 @@ class Search:
         displacements += self._vote(members, rows, slope, reach_m)
         judged = list[Proposal]()
         for state in self._align_all(displacements, centre, members, rows):
-            state[2] = state[:2] @ slope  # the group stays on the ground
+            state[2] = state[:2] @ slope  # rise in z: the group stays on the ground
             moved_m = np.linalg.norm(state[:2])
             if MIN_MOTION_M < moved_m <= limit_m and not _is_ambiguous(points, state[:3]):
                 motion = RigidMotion(state, centre)
@@ -360,7 +377,7 @@ class Search:
                 previous = proposal
                 for axis in (*axes, *-axes):
                     state = proposal.motion.state + step_m * axis
-                    state[2] = state[:2] @ slope
+                    state[2] = state[:2] @ slope  # rise in z, along the ground
                     motion = replace(proposal.motion, state=state)
                     trial = judge(proposal.group, members, motion, self.source, self.target)
                     proposal = max(proposal, trial, key=lambda candidate: candidate.gain)
@@ -412,7 +429,8 @@ class Search:
 
 def _are_alike(state: Float, other_state: Float) -> bool:
     """Return True if two states (4,) differ by less than 0.1 m in x and y, and 0.1 rad in yaw."""
-    return bool(np.abs(state - other_state)[[0, 1, 3]].max() < MIN_MOTION_M)
+    x, y, _, yaw = np.abs(state - other_state)  # z follows from x and y
+    return bool(max(x, y, yaw) < MIN_MOTION_M)
 
 
 def _in_box(points: Float, inner: Float, slack_m: float) -> Bool:
@@ -468,8 +486,11 @@ def find_movers(
         source: N points above the ground.
         target: M points of the other cloud above the ground, in the same frame.
         height_m: (N,) height of the source points above the ground.
-        apart_s: Time between the clouds, None if unknown. The search covers up to 38 m/s.
-        initial: (N,3) flow. The search of a group also starts at the median flow of its members.
+        ground: Height of the ground in the frame of the clouds. Groups stay on it as they move.
+        apart_s: Time between the clouds, None if unknown: then 0.1 s is assumed. The search covers
+            speeds up to 38 m/s over at most 0.4 s.
+        initial: (N,3) flow in metres, or None. The search of a group also starts at the median flow
+            of its members.
 
     Returns:
         The motions, and (N,) the index of each source point's motion, -1 for static points.
@@ -538,6 +559,6 @@ def _claim_fitting_points(
     rows = rows[is_near(tree_of(members), source.points[rows], SURFACE_M)]
     if len(rows):
         static = RigidMotion(np.zeros(4), motion.centre)
-        static_cost, _ = compare(source, rows, target, static)
-        moved_cost, _ = compare(source, rows, target, motion)
+        static_cost, _ = cost_on_target(source, rows, target, static)
+        moved_cost, _ = cost_on_target(source, rows, target, motion)
         instance[rows[moved_cost < static_cost]] = k

@@ -30,15 +30,15 @@ def apply(state: Float, points: Float, centre: Float) -> Float:
     """Return the (N,3) points of an object, turned about its centre and displaced.
 
     Args:
-        state: (4,) state of all points, or (N,4) one for each point.
+        state: Displacement x, y, z (m) and yaw (rad): (4,) for all points, or (N,4).
         points: (N,3) metres.
-        centre: (3,) centre of the rotation, or (N,3) one for each point.
+        centre: Centre of the rotation: (3,) for all points, or (N,3); in the frame of the points.
     """
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
 def undo(state: Float, points: Float, centre: Float) -> Float:
-    """Return the (N,3) points moved back by the inverse of `apply`, with the same arguments."""
+    """Return the (N,3) points before `apply` moved them by this state about this centre."""
     return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
 
 
@@ -56,11 +56,12 @@ class Model:
     """Accumulated surface of an object, to which new points are aligned."""
 
     def __init__(self, points: Float) -> None:
+        """Start the model with points (N,3), metres, in the object's frame."""
         self.points = np.zeros((0, 3))  # (M,3) object's frame, about 1000 at most, ascending in x
         self.add(points)
 
     def add(self, points: Float) -> None:
-        """Add (N,3) points in the object's frame, thinning all points if there are too many."""
+        """Add (N,3) points in the object's frame, in place; more than 1000 in all are thinned."""
         points = np.concatenate([self.points, points])
         points = points[np.argsort(points[:, 0], kind="stable")]
         # contiguous, or the kernels are compiled for both layouts
@@ -69,7 +70,7 @@ class Model:
         self._information = np.full((len(self.points), 3, 3), np.nan)
 
     def covers(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for (N,3) points (object's frame) within ``within_m`` of the model."""
+        """Return (N,) True for points (N,3, object's frame) within ``within_m`` of the model."""
         covered = np.empty(len(points), np.bool_)
         _are_near(points, self.points, within_m, covered)
         return covered
@@ -77,7 +78,7 @@ class Model:
     def align(
         self, points: Float, centre: Float, predicted: Float, prediction_std: Float
     ) -> Float | None:
-        """Return the state (4,) that fits the model to the points, None for too few matches.
+        """Return the state (4,) that fits the model to the points, None for fewer than 5 matches.
 
         Displacement x, y and yaw are solved with Tukey weights. The height z stays as predicted: on
         an object hit by few beams it would follow the beams. Of many points some 250 are used.
@@ -140,48 +141,52 @@ def _align(
     state: Float,
 ) -> bool:
     """Fit ``state`` (4,), in place, to points, see `Model.align`; False for too few matches."""
-    J = np.zeros((3, 3))  # derivative of the point by x, y and yaw, object's frame
-    JA = np.empty((3, 3))
-    in_object, arm, from_centre, residual = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    # Gauss-Newton (iterated least squares), a step per gate. A point in the object's frame moves by
+    # -J x if x, y and yaw of the state change by x. Hence with the inverse covariance A and Tukey's
+    # weight w of each match the step solves H x = g: H = Σ w Jᵀ A J, g = Σ w Jᵀ A residual.
+    J = np.zeros((3, 3))  # rows: x, y, z of the point; columns: x, y, yaw; the row of z stays 0
+    JA = np.empty((3, 3))  # w Jᵀ A
+    from_centre, turned, in_object, residual = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for gate_m in GATES_M:
+        # The first two columns of J are the rotation from the world to the object's frame.
         J[0, 0] = J[1, 1] = np.cos(state[3])
         J[0, 1] = np.sin(state[3])
         J[1, 0] = -J[0, 1]
-        H, g = np.zeros((3, 3)), np.zeros(3)  # normal equations H x = g of x, y and yaw
-        num = 0
+        H, g = np.zeros((3, 3)), np.zeros(3)
+        num_matches = 0
         for i in range(len(points)):
-            # The point in the object's frame, by the inverse of the state
+            # The point in the object's frame: moved and turned back, see `undo`
             for a in range(3):
                 from_centre[a] = points[i, a] - centre[a] - state[a]
-            arm[0] = J[0, 0] * from_centre[0] + J[0, 1] * from_centre[1]
-            arm[1] = J[1, 0] * from_centre[0] + J[1, 1] * from_centre[1]
-            arm[2] = from_centre[2]
+            turned[0] = J[0, 0] * from_centre[0] + J[0, 1] * from_centre[1]
+            turned[1] = J[1, 0] * from_centre[0] + J[1, 1] * from_centre[1]
+            turned[2] = from_centre[2]
             for a in range(3):
-                in_object[a] = arm[a] + centre[a]
+                in_object[a] = turned[a] + centre[a]
             row, squared = _nearest(in_object, surface, gate_m)
             if row < 0:
                 continue
-            num += 1
-            # Gauss-Newton with Tukey's weight: H += w Jᵀ A J, g += w Jᵀ A residual. A motion of the
-            # object moves ``in_object`` by -J, hence g is the descent direction.
+            num_matches += 1
+            # The match: its residual, inverse covariance and weight
+            for a in range(3):
+                residual[a] = in_object[a] - surface[row, a]
             A = information[row]
             if np.isnan(A[0, 0]):
                 _inform(surface, row, A)
             weight = (1 - squared / gate_m**2) ** 2
-            J[0, 2] = -arm[1]
-            J[1, 2] = arm[0]
-            for a in range(3):
-                residual[a] = in_object[a] - surface[row, a]
+            # Its part of the sums; a turn moves the point perpendicular to its arm.
+            J[0, 2] = -turned[1]
+            J[1, 2] = turned[0]
             for a in range(3):
                 for b in range(3):
                     JA[a, b] = weight * (J[0, a] * A[0, b] + J[1, a] * A[1, b])
                 g[a] += JA[a, 0] * residual[0] + JA[a, 1] * residual[1] + JA[a, 2] * residual[2]
                 for b in range(3):
                     H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
-        if num < MIN_FIT:
+        if num_matches < MIN_FIT:
             return False
-        weight = min(1.0, MAX_WEIGHT / num)
-        _step(H, g, weight, predicted, prior, state)
+        # The matches together weigh at most `MAX_WEIGHT` against the prediction.
+        _step(H, g, min(1.0, MAX_WEIGHT / num_matches), predicted, prior, state)
     return True
 
 
@@ -203,7 +208,8 @@ def _step(H: Float, g: Float, weight: float, predicted: Float, prior: Float, sta
 @inlined
 def _inform(surface: Float, row: int, information: Float) -> None:
     """Write the inverse covariance (3,3) of the surface (M,3), ascending in x, at one row."""
-    # The nearest points, the nearest first, searched as in `_nearest`
+    # Phase 1: the nearest points (the point itself is among them), sorted by distance. The search
+    # goes from the row to both sides, and ends where x alone is farther than the last of them.
     near_row = np.empty(min(NUM_NEAR, len(surface)), np.int64)
     near_squared = np.empty(len(near_row))
     for k in range(len(near_row)):
@@ -217,6 +223,7 @@ def _inform(surface: Float, row: int, information: Float) -> None:
             for a in range(3):
                 squared += (surface[other, a] - surface[row, a]) ** 2
             if squared < near_squared[-1]:
+                # Farther points make room for it, and the last one is dropped.
                 k = len(near_row) - 1
                 while k > 0 and near_squared[k - 1] > squared:
                     near_row[k] = near_row[k - 1]
@@ -225,6 +232,7 @@ def _inform(surface: Float, row: int, information: Float) -> None:
                 near_row[k] = other
                 near_squared[k] = squared
             other += step
+    # Phase 2: their covariance
     covariance = np.zeros((3, 3))
     mean = np.zeros(3)
     for near in near_row:

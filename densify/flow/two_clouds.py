@@ -24,7 +24,7 @@ from densify.geometry.nearest import nearest, tree_of
 from densify.geometry.types import Float, FlowField, Int, Motion, Stretch
 
 _MAX_EXTENT_M = 400.0  # greatest distance in x and y, from the middle, of searched points
-_MIN_LOW_M = 0.04  # least height of points below a moving group
+_MIN_LOW_M = 0.04  # least height of points below a moving group: lower ones are of the road
 _SCANNERS_APART_M = 1000.0  # lifts each scanner's points out of reach of the others'
 _BELOW_M = 0.3  # horizontal distance of points below a moving group
 
@@ -50,7 +50,7 @@ def estimate_flow(
     Args:
         source: (N,3) metres, z up, with or without the ground.
         target: (M,3) metres, as ``source``.
-        config: Settings; the sections ``flow`` and ``objective`` are used.
+        config: Settings, None for the defaults; ``flow.engine`` and ``objective`` are used.
         initial: (N,3) flow to start from. It is needed only for objects faster than the search
             covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
         source_offset_ns: (N,) times of the points. Both clouds use one clock, or each counts from
@@ -91,7 +91,8 @@ def estimate_flow(
 class _PointTimes(NamedTuple):
     """Firing times of two clouds, in units of the time between the clouds."""
 
-    shares: list[Float]  # (N,) and (M,): 0 at the middle of the source's times, 1 at the target's
+    # (N,) and (M,): 0 at the middle of the source's times, 1 at the target's
+    shares: tuple[Float, Float]
     apart_s: float  # time between the clouds
 
 
@@ -105,41 +106,46 @@ def _flow_of_groups(
     # Coordinates of a map are large. Relative to the middle they lose no accuracy.
     middle = np.median(clouds[0], axis=0)
     points = [cloud - middle for cloud in clouds]
-    rows_inside = [
-        np.flatnonzero((np.abs(cloud[:, :2]) < _MAX_EXTENT_M).all(1)) for cloud in points
-    ]
-    points_inside = [cloud[rows] for cloud, rows in zip(points, rows_inside, strict=True)]
-    ground = HeightMap.of(points_inside)
-    heights_m = [ground.above(cloud) for cloud in points_inside]
-    rows_above = [
-        rows[height_m >= ABOVE_GROUND_M]
-        for rows, height_m in zip(rows_inside, heights_m, strict=True)
-    ]
+
+    # Phase 1: the obstacles of both clouds, which are points above their common ground
+    near_rows = [np.flatnonzero((np.abs(cloud[:, :2]) < _MAX_EXTENT_M).all(1)) for cloud in points]
+    near_points = [cloud[rows] for cloud, rows in zip(points, near_rows, strict=True)]
+    ground = HeightMap.of(near_points)
+    heights_m = [ground.above(cloud) for cloud in near_points]
+    is_obstacle = [height_m >= ABOVE_GROUND_M for height_m in heights_m]
+    source_rows, target_rows = (
+        rows[mask] for rows, mask in zip(near_rows, is_obstacle, strict=True)
+    )
     field = FlowField.zero(len(clouds[0]))
-    if not (len(rows_above[0]) and len(rows_above[1])):
+    if not (len(source_rows) and len(target_rows)):
         return field
+
+    # Phase 2: the moving groups
     if times is not None:
-        shares = times.shares
+        source_share, target_share = times.shares
     else:
-        shares = [np.zeros(len(clouds[0])), np.ones(len(clouds[1]))]
+        source_share, target_share = np.zeros(len(clouds[0])), np.ones(len(clouds[1]))
         if lidars is not None:
             _separate_scanners(points, lidars)
+    source_points, target_points = points
+    motions, instance = find_movers(
+        source=PairCloud(source_points[source_rows], source_share[source_rows]),
+        target=PairCloud(target_points[target_rows], target_share[target_rows]),
+        height_m=heights_m[0][is_obstacle[0]],
+        ground=ground,
+        apart_s=None if times is None else times.apart_s,
+        initial=None if initial is None else initial[source_rows],
+    )
+    field.instance[source_rows] = instance
+    is_low = ~is_obstacle[0] & (heights_m[0] > _MIN_LOW_M)
+    _attach_below(source_points, field, near_rows[0][is_low])
 
-    source = PairCloud(points[0][rows_above[0]], shares[0][rows_above[0]])
-    target = PairCloud(points[1][rows_above[1]], shares[1][rows_above[1]])
-    source_height_m = heights_m[0][heights_m[0] >= ABOVE_GROUND_M]
-    apart_s = None if times is None else times.apart_s
-    source_flow = None if initial is None else initial[rows_above[0]]
-    motions, instance = find_movers(source, target, source_height_m, ground, apart_s, source_flow)
-    field.instance[rows_above[0]] = instance
-    is_low = (heights_m[0] < ABOVE_GROUND_M) & (heights_m[0] > _MIN_LOW_M)
-    _attach_below(points[0], field, rows_inside[0][is_low])
-
+    # Phase 3: their flow, from the source's middle time (share 0) to the target's (share 1)
     to_reference = np.zeros_like(clouds[0])
     for k, motion in enumerate(motions):
         rows = np.flatnonzero(field.instance == k)
-        measured = points[0][rows]
-        at_reference = motion.undo(measured, shares[0][rows])
+        measured = source_points[rows]
+        at_reference = motion.undo(measured, source_share[rows])
         field.displacement[rows] = motion.place(at_reference, 1.0) - at_reference
         to_reference[rows] = at_reference - measured
     field.moving[:] = field.instance >= 0
@@ -203,14 +209,14 @@ def _times_as_shares(times_ns: tuple[Int, Int] | None) -> _PointTimes | None:
         return None
     source_share = (times_ns[0] - middle_ns[0]) / gap_ns
     target_share = 1 + (times_ns[1] - middle_ns[1]) / gap_ns
-    return _PointTimes([source_share, target_share], abs(gap_ns) * 1e-9)
+    return _PointTimes((source_share, target_share), abs(gap_ns) * 1e-9)
 
 
 # --- The engine ``pairs``
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Chain the flow of neighbouring sweeps: the engine ``pairs``, for recordings of two sweeps."""
+    """Return the motion of the engine ``pairs``: chained `estimate_flow` of neighbouring sweeps."""
     # The engine ``groups`` is the default of `estimate_flow`, which does not know ``pairs``.
     pair_settings = replace(settings, flow=replace(settings.flow, engine="groups"))
 

@@ -216,7 +216,7 @@ def compress_heights(points: Float, gap_m: Float) -> Float:
 
     Args:
         points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
-        gap_m: (N,) distance between neighbouring rings at each point.
+        gap_m: (N,) distance between neighbouring rings at each point, metres.
     """
     compressed = points.copy()
     compressed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
@@ -232,7 +232,7 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Link seeds and points within 0.4 m of seeds into clusters.
+    """Return the clusters of seeds and of points within 0.4 m of seeds, linked within 0.6 m.
 
     Seeds with a share of other seeds below 0.4 around them, as in a hedge, do not count.
 
@@ -241,7 +241,7 @@ def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
         seed: (N,) True for seeds.
 
     Returns:
-        The number of clusters, and (N,) labels, -1 for points in no cluster.
+        The number of clusters, and (N,) labels from 0, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
     rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from densify.flow.tracking.candidates import LINK_M, Obstacles, Strips, firing_times_s
 from densify.flow.tracking.following import MAX_MISSED_S
-from densify.flow.tracking.objects import LANE_M, MovingObject, Shape, Track, near_m
+from densify.flow.tracking.objects import LANE_M, Lane, MovingObject, Shape, Track, near_m
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.range_image import FreeSpace
 from densify.free_space.sensor import Sensors
@@ -50,7 +50,7 @@ class SweepPoints:
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
-        """Return the points of the sweep with index i that are over 0.08 m above the ground."""
+        """Return the points over 0.08 m above the ground of sweep index i with its obstacles."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
@@ -81,7 +81,8 @@ class SweepPoints:
 def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
     """Return the accumulated shape of a track, for slow objects without their surroundings.
 
-    Objects faster than 2 m/s keep all points. Otherwise three kinds of points are dropped:
+    Objects faster than 2 m/s in their middle sweep keep all points. Otherwise three kinds of points
+    are dropped, unless none would remain:
 
     - Echoes merged with a wall's. They occur only in even or only in odd sweeps.
     - Points of a bush. They are static, or lie among static points.
@@ -178,9 +179,11 @@ def assign_points(
 
 
 def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
-    """Return (N,) the index in ``objects`` of the nearest object at each point of sweep i, or -1.
+    """Return (N,) the index in ``objects`` of the nearest object at each point of a sweep, or -1.
 
-    A point belongs to an object if it lies near the shape, or inside the outline seen from above.
+    ``cloud`` holds the N points of sweep index i. A point belongs to an object if it lies near the
+    shape and at least 0.2 m above the ground, or inside the outline seen from above. Points less
+    than 0.1 m above the ground belong to no object of up to 2 m/s.
     """
     instance = np.full(len(cloud.points), -1, np.int32)
     least_m = np.full(len(cloud.points), np.inf)
@@ -218,44 +221,52 @@ def extend_vehicles(
     """Assign free points ahead of and behind vehicles, in their lane, to the vehicles, in place.
 
     The middle of a long side that moves along itself is never seen through, and lacks candidates.
-    The extension ends at a hole, or where another sweep sees through the moved points.
+    Vehicles are objects faster than 2 m/s. The extension ends at a hole (0.6 to 2 m, by the spacing
+    of the rays), or where another sweep sees through more than 5 % of the moved points.
 
     Args:
         instance: (N,) index of each point's object, -1 for none; changed in place.
         cloud: The N points of a batch.
-        i: First sweep of the batch.
+        i: Index of the first sweep of the batch.
         objects: Confirmed objects.
     """
-    batch_s = np.ptp(cloud.time_s) if len(cloud.time_s) else 0.0
-    for k, (track, shape) in enumerate(objects):
+    for k, moving_object in enumerate(objects):
+        track, shape = moving_object
         members = np.flatnonzero(instance == k)
-        speed_m_s = _speed_m_s(track, i, space.clock)
-        if not len(members) or speed_m_s <= _MAX_WALKER_SPEED_M_S:
+        if not len(members) or _speed_m_s(track, i, space.clock) <= _MAX_WALKER_SPEED_M_S:
             continue
         at_s = track.seen_at(space.clock.time_ns[i])
-        lane = MovingObject(track, shape).lane(at_s)
+        lane = moving_object.lane(at_s)
         middle = track.place(shape.points.mean(0, keepdims=True), at_s)[0]
-        # Phase 1: free points in the lane. The first tests are fast and coarse: a box, and the lane
-        # widened by the motion within the batch. The last test moves all points to one time.
-        reach_m = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
-        rows = cloud.strips.rows_inside(middle - reach_m, middle + reach_m)
-        rows = rows[instance[rows] < 0]
-        rows = rows[lane.holds(cloud.points[rows], speed_m_s * batch_s)]
-        at_one_time = track.carry(cloud.points[rows], cloud.time_s[rows], at_s)
-        fits = lane.holds(at_one_time)
-        rows = rows[fits]
-        # Phase 2: points that are linked with the object, by coordinates along the heading
-        along_m = at_one_time[fits, :2] @ lane.ahead
+        rows, along_m = _free_rows_in_lane(cloud, instance < 0, track, lane, middle, at_s)
+        # Only points that are linked with the object, by coordinates along the heading
         members_at_one_time = track.carry(cloud.points[members], cloud.time_s[members], at_s)
         members_m = members_at_one_time[:, :2] @ lane.ahead
         columns_m = columns_apart_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
         hole_m = float(np.clip(NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
         is_linked = _is_linked(along_m, members_m, hole_m)
-        # Phase 3: points up to the first violations
+        # Of these, only points up to the first violations
         if is_linked.any():
-            rows = rows[is_linked]
+            linked_rows = rows[is_linked]
             ahead_m = along_m[is_linked] - np.median(members_m)
-            instance[rows[_is_unviolated(track, cloud, rows, ahead_m, i, space)]] = k
+            is_kept = _is_unviolated(track, cloud, linked_rows, ahead_m, i, space)
+            instance[linked_rows[is_kept]] = k
+
+
+def _free_rows_in_lane(
+    cloud: SweepPoints, is_free: Bool, track: Track, lane: Lane, middle: Float, at_s: float
+) -> tuple[Int, Float]:
+    """Return the (K,) free rows of a cloud in a lane, and (K,) their coordinates along it (m)."""
+    # First fast and coarse tests: a box, and the lane widened by the motion within the batch
+    reach_m = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
+    boxed_rows = cloud.strips.rows_inside(middle - reach_m, middle + reach_m)
+    free_rows = boxed_rows[is_free[boxed_rows]]
+    travel_m = float(np.linalg.norm(track.path.rate(at_s)[:2])) * np.ptp(cloud.time_s)
+    near_rows = free_rows[lane.holds(cloud.points[free_rows], travel_m)]
+    # Then the exact test, with all points moved to one time
+    at_one_time = track.carry(cloud.points[near_rows], cloud.time_s[near_rows], at_s)
+    in_lane = lane.holds(at_one_time)
+    return near_rows[in_lane], at_one_time[in_lane, :2] @ lane.ahead
 
 
 def columns_apart_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:

@@ -64,10 +64,10 @@ class DistanceField:
         return DistanceField(nearness, low, tree_of(points), time_s)
 
     def raise_nearness(self, nearness: Bytes, group: Group, velocities: Float) -> None:
-        """Raise ``nearness`` (V,N), in place, to that of N points moved at V velocities.
+        """Raise ``nearness`` (V,N), in place, to that of a group's N points at V velocities.
 
-        Nearness is from 0 to 255. The points are moved to the time of this sweep, at velocities
-        (V,3), m/s, world.
+        Nearness is from 0 (no candidate within 0.6 m) to 255. The points are moved at velocities
+        (V,3), m/s, world, to the time when this sweep fired at the new position.
         """
         if self.tree is None:
             return
@@ -123,6 +123,7 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
 
     Args:
         group: The cluster's points in batch n.
+        n: Index of the cluster's batch.
         fields: For each batch, the distance fields of its sweeps.
         clock: Times of the batches.
     """
@@ -192,24 +193,25 @@ def _spread(
 def _look_up(
     first: int,
     last: int,
-    points: Float,
-    offset_s: Float,
-    velocities: Float,
-    elapsed_s: Float,
-    low: Float,
-    cells_per_m: float,
-    grid: Bytes,
+    points: Float,  # (N,3) world
+    offset_s: Float,  # (N,) firing times since the group's middle time
+    velocities: Float,  # (V,3) m/s
+    elapsed_s: Float,  # (V,) from the group's middle time to the firing time at the moved position
+    low: Float,  # (3,) corner of the grid, world
+    voxels_per_m: float,
+    grid: Bytes,  # (X,Y,Z) nearness of the voxels
     nearness: Bytes,
 ) -> None:
     """Raise ``nearness`` (V,N), in place, to the grid's at N points moved at V velocities."""
-    # Positions up to one cell below the grid are truncated to cell 0. Its margin has nearness 0.
     num_x, num_y, num_z = grid.shape
     for v in range(first, last):
         for i in range(len(points)):
+            # A point fired after the middle time has less time to move. Positions up to a voxel
+            # below the grid are truncated to voxel 0: it is in the margin, and has nearness 0.
             moving_s = elapsed_s[v] - offset_s[i]
-            x = int((points[i, 0] + velocities[v, 0] * moving_s - low[0]) * cells_per_m)
-            y = int((points[i, 1] + velocities[v, 1] * moving_s - low[1]) * cells_per_m)
-            z = int((points[i, 2] + velocities[v, 2] * moving_s - low[2]) * cells_per_m)
+            x = int((points[i, 0] + velocities[v, 0] * moving_s - low[0]) * voxels_per_m)
+            y = int((points[i, 1] + velocities[v, 1] * moving_s - low[1]) * voxels_per_m)
+            z = int((points[i, 2] + velocities[v, 2] * moving_s - low[2]) * voxels_per_m)
             if 0 <= x < num_x and 0 <= y < num_y and 0 <= z < num_z:
                 nearness[v, i] = max(nearness[v, i], grid[x, y, z])
 
@@ -236,7 +238,8 @@ _MAX_MISSED_BATCHES, MAX_MISSED_S = 1, 0.2
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
     """Return the clusters that may start a track: batch index, (K,) rows of the batch's obstacles.
 
-    Large clusters come first. Those near the ends of the stretch come later.
+    They have at least 8 points, 40 % of them seeds. The largest come first; those less than 0.5 s
+    from an end of the stretch count as smaller.
     """
     starts = []
 
@@ -264,6 +267,7 @@ def find_nearby_velocities(
     a long flat side moves along itself.
 
     Args:
+        batch: Sweeps in which the cluster was found.
         members: Rows of the cluster in the batch's obstacles.
         objects: Confirmed objects.
     """

@@ -35,10 +35,10 @@ class GroupMotion:
     stretch: Stretch  # the sweeps, in one world
     tracks: tuple[Track, ...]  # tracks of the confirmed moving objects
     # For each sweep (N,) int32, the index of the track with which each point moves, -1 for static
-    instance: tuple[Instance, ...]
+    track_of_point: tuple[Instance, ...]
     # Non-rigid motion of the tracks that have one, by index in ``tracks``
     bendings: Mapping[int, Bending]
-    number: Int  # (K,) number of the object that each track belongs to
+    object_of_track: Int  # (K,) number of the object that each track belongs to
 
     def with_stretch(self, stretch: Stretch) -> GroupMotion:
         """Return the same motion on another copy of its stretch, see `SharedMotion`."""
@@ -47,20 +47,21 @@ class GroupMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
-        It excludes ego-motion, in the lidar frame of ``frame``. Points are lost if the target is
-        over 0.2 s before or after all observations of their object.
+        It excludes ego-motion, and is in the lidar frame of ``frame``. Instances are numbers of
+        objects, not of tracks. Points are lost if the target is over 0.2 s before or after all
+        observations of their track.
         """
         i = self.stretch.frames.index(frame)
         j = self.stretch.frames.index(target)
         registered = self.stretch.sweeps[i]
-        instance = self.instance[i]
+        track_of_point = self.track_of_point[i]
         R_lidar_world = registered.T_world_lidar[:3, :3].T
         clock = Clock.of(self.stretch)
         source_s = clock.time_s[i]
         target_s = clock.time_s[j]
-        to_reference, displacement, velocity_m_s = np.zeros((3, len(instance), 3))
-        lost = np.zeros(len(instance), bool)
-        for k, rows in _rows_by_track(instance):
+        to_reference, displacement, velocity_m_s = np.zeros((3, len(track_of_point), 3))
+        lost = np.zeros(len(track_of_point), bool)
+        for k, rows in _rows_by_track(track_of_point):
             track = self.tracks[k]
             seen_s = firing_times_s(self.stretch, i, rows)
             measured = poses.transform(registered.T_world_lidar, registered.sweep.points[rows])
@@ -75,9 +76,11 @@ class GroupMotion:
             displacement[rows] = (arrived - at_reference) @ R_lidar_world.T
             velocity_m_s[rows] = track.velocity_m_s(arrived, target_s) @ R_lidar_world.T
             lost[rows] = not is_tracked_at(track, j, clock)
-        moving = instance >= 0
-        number = np.append(self.number, -1)[instance].astype(np.int32)
-        return FlowField(displacement, moving, number, lost, to_reference, velocity_m_s)
+        # The last entry, at index -1, is for static points.
+        instance = np.append(self.object_of_track, -1)[track_of_point].astype(np.int32)
+        return FlowField(
+            displacement, track_of_point >= 0, instance, lost, to_reference, velocity_m_s
+        )
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,9 @@ class Bending:
     def carry(self, i: int, j: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
         """Return sweep i's N points at the reference times of sweeps i and j: two (N,3) arrays.
 
-        Both are in the object's frame; ``seen_s`` are the points' firing times. If the object has
-        no points in sweep j, it bends as in the nearest sweep that has some.
+        Both are in the object's frame, in metres. ``seen_s`` (N,) are the points' firing times. The
+        object has points in sweep i. If it has none in sweep j, it bends as in the sweep nearest in
+        time that has some.
         """
         source = self.sweeps.index(i)
         target = self.sweeps.index(clock.nearest(j, self.sweeps))
@@ -103,7 +107,7 @@ class Bending:
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotion:
-    """Return the motion of all objects in the scene, at any sweep rate; takes no argument.
+    """Return the motion of all objects in the scene, at any sweep rate; ``argument`` is not used.
 
     Below 10 Hz, objects that turn, bend or are occluded between sweeps are tracked worse or lost.
     """
@@ -115,9 +119,10 @@ def find_group_motion(
     candidates: Sequence[Candidates],
     velocities_m_s: Sequence[Float] | None = None,
 ) -> GroupMotion:
-    """Find the moving objects among the points of each sweep that may move.
+    """Return the motion of the objects found among the points of each sweep that may move.
 
     Args:
+        scene: Registered sweeps. Points of batches without a sweep that is asked for stay static.
         candidates: For each sweep, its C points above the ground, and which may move.
         velocities_m_s: For each sweep, (C,3) approximate velocities of these points, world frame.
             None estimates them by a vote of neighbouring sweeps.
@@ -135,14 +140,14 @@ def find_group_motion(
         return [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in batch]
 
     def bend(k: int) -> Bending:
-        return _find_bending(k, tracks[k], stretch, moved_with)
+        return _find_bending(k, tracks[k], stretch, track_of_point)
 
     with ThreadPoolExecutor(num_threads()) as pool:
-        instance = tuple(chain.from_iterable(pool.map(assign_batch, space.batches)))
-        number, carrier = join_pieces(stretch, tracks, instance, space)
-        # Points move with the carrier of their track. The last entry, of index -1, is static.
-        carrier_of_instance: Instance = np.append(carrier, -1).astype(np.int32)
-        moved_with = tuple(carrier_of_instance[of_point] for of_point in instance)
+        own_track = tuple(chain.from_iterable(pool.map(assign_batch, space.batches)))
+        joined = join_pieces(stretch, tracks, own_track, space)
+        # Points move with the carrier of their track. The last entry, at index -1, is static.
+        carrier: Instance = np.append(joined.carrier_of_track, -1).astype(np.int32)
+        track_of_point = tuple(carrier[sweep_track] for sweep_track in own_track)
         near_tracks = [
             k
             for k, track in enumerate(tracks)
@@ -154,14 +159,16 @@ def find_group_motion(
             for k, bending in zip(near_tracks, pool.map(bend, near_tracks), strict=True)
             if np.isfinite(bending.softened.alpha)
         }
-    return GroupMotion(stretch, tuple(tracks), moved_with, bendings, number)
+    return GroupMotion(stretch, tuple(tracks), track_of_point, bendings, joined.object_of_track)
 
 
-def _find_bending(k: int, track: Track, stretch: Stretch, instance: Sequence[Instance]) -> Bending:
-    """Return the bending of the object with index k, from its points in all sweeps."""
+def _find_bending(
+    k: int, track: Track, stretch: Stretch, track_of_point: Sequence[Instance]
+) -> Bending:
+    """Return the bending of the track with index k, from its points in all sweeps."""
     snapshots, sweeps = [], []
     for i, registered in enumerate(stretch.sweeps):
-        rows = np.flatnonzero(instance[i] == k)
+        rows = np.flatnonzero(track_of_point[i] == k)
         if len(rows):
             points = poses.transform(registered.T_world_lidar, registered.sweep.points[rows])
             seen_s = firing_times_s(stretch, i, rows)
@@ -170,11 +177,11 @@ def _find_bending(k: int, track: Track, stretch: Stretch, instance: Sequence[Ins
     return Bending(tuple(sweeps), soften(snapshots))
 
 
-def _rows_by_track(instance: Instance) -> list[tuple[int, Int]]:
-    """Return, for each track in ``instance`` (N,), its index and its points' ascending indices."""
-    rows = np.flatnonzero(instance >= 0)
-    rows = rows[np.argsort(instance[rows], kind="stable")]
-    tracks, begins = np.unique(instance[rows], return_index=True)
+def _rows_by_track(track_of_point: Instance) -> list[tuple[int, Int]]:
+    """Return the index of each track with points, and their ascending indices."""
+    rows = np.flatnonzero(track_of_point >= 0)
+    rows = rows[np.argsort(track_of_point[rows], kind="stable")]
+    tracks, begins = np.unique(track_of_point[rows], return_index=True)
     return list(zip(tracks.tolist(), np.split(rows, begins)[1:], strict=True))
 
 
@@ -193,8 +200,8 @@ _MAX_DIFFERENCE_M_S = 0.4  # twice the error of the velocity of a long track
 class JoinedObjects(NamedTuple):
     """The objects of K tracks."""
 
-    number: Int  # (K,) number of the object that each track belongs to
-    carrier: Int  # (K,) index of the track with which the points of each track move
+    object_of_track: Int  # (K,) number of the object that each track belongs to
+    carrier_of_track: Int  # (K,) index of the track with which the points of each track move
 
 
 class _Piece(NamedTuple):
@@ -217,19 +224,17 @@ class _Piece(NamedTuple):
 
 
 def join_pieces(
-    stretch: Stretch, tracks: Sequence[Track], instance: Sequence[Instance], space: FreeSpace
+    stretch: Stretch, tracks: Sequence[Track], track_of_point: Sequence[Instance], space: FreeSpace
 ) -> JoinedObjects:
-    """Find the object that each of the K tracks belongs to, and the motion of its points.
+    """Return the object that each of the K tracks belongs to, and the motion of its points.
 
-    An object has the number of its piece with most points. A track without points is an object of
-    its own.
-
-    Args:
-        instance: For each sweep, (N,) int32, the index of each point's track, -1 for static points.
+    An object has the number of its track with most points. A track without points is an object of
+    its own. ``track_of_point`` holds, for each sweep, (N,) int32: the index of each point's track,
+    -1 for static points.
     """
-    pieces = _make_pieces(stretch, tracks, instance, space)
-    number = np.arange(len(tracks))
-    carrier = np.arange(len(tracks))
+    pieces = _make_pieces(stretch, tracks, track_of_point, space)
+    object_of_track = np.arange(len(tracks))
+    carrier_of_track = np.arange(len(tracks))
     # The piece with most points starts an object, which takes in pieces until none fits. The larger
     # object may touch further pieces.
     queue = sorted(pieces, key=lambda k: (-pieces[k].num_points, k))
@@ -242,14 +247,14 @@ def join_pieces(
             moving_object = MovingObject(tracks[k], Shape.of(np.concatenate(clouds)))
             sweeps = set().union(*(part.points for part in parts))
             new_parts = [m for m in queue if _is_part(pieces[m], moving_object, sweeps, space)]
-            number[new_parts] = k
+            object_of_track[new_parts] = k
             for m in new_parts:
                 if not _has_own_motion(pieces[m], tracks[k], space):
-                    carrier[m] = k
+                    carrier_of_track[m] = k
             parts += [pieces[m] for m in new_parts]
             queue = [m for m in queue if m not in new_parts]
             has_grown = bool(new_parts)
-    return JoinedObjects(number, carrier)
+    return JoinedObjects(object_of_track, carrier_of_track)
 
 
 def _has_own_motion(piece: _Piece, track: Track, space: FreeSpace) -> bool:
@@ -266,14 +271,13 @@ def _has_own_motion(piece: _Piece, track: Track, space: FreeSpace) -> bool:
 
 
 def _make_pieces(
-    stretch: Stretch, tracks: Sequence[Track], instance: Sequence[Instance], space: FreeSpace
+    stretch: Stretch, tracks: Sequence[Track], track_of_point: Sequence[Instance], space: FreeSpace
 ) -> dict[int, _Piece]:
     """Return the piece of each track with points, by index in ``tracks``; see `join_pieces`."""
     pieces: dict[int, _Piece] = {}
-    for i, (registered, of_point) in enumerate(zip(stretch.sweeps, instance, strict=True)):
-        for k in np.unique(of_point[of_point >= 0]).tolist():
-            rows = np.flatnonzero(of_point == k)
-            sweep = registered.sweep
+    for i, registered in enumerate(stretch.sweeps):
+        sweep = registered.sweep
+        for k, rows in _rows_by_track(track_of_point[i]):
             ring_gap_m = space.sensors.gap_m(sweep.points[rows], sweep.lidar[rows])
             piece = pieces.setdefault(k, _Piece(tracks[k], {}, {}, {}))
             piece.points[i] = poses.transform(registered.T_world_lidar, sweep.points[rows])
@@ -286,10 +290,6 @@ def _is_part(
     piece: _Piece, moving_object: MovingObject, sweeps: set[int], space: FreeSpace
 ) -> bool:
     """Return True if a piece belongs to an object that is observed in ``sweeps``."""
-    # One of three rules must hold:
-    # 1. The piece touches the object in most common sweeps, and lies in the object's box.
-    # 2. The piece touches the object in most common sweeps, and moves alike.
-    # 3. The piece moves alike in the object's lane, ahead of or behind the object without a gap.
     common = sorted(sweeps & piece.points.keys())
     if not common:
         return False
@@ -297,29 +297,30 @@ def _is_part(
     middle_s = space.clock.time_s[middle]
     if _is_away(piece, moving_object, middle):
         return False
+    # Rule 1: the piece touches the object in most common sweeps, and lies in the object's box.
     is_touching = _touches(piece, moving_object, common)
     if is_touching and _lies_in_box(piece, moving_object, common, middle_s):
-        return True  # rule 1
+        return True
 
+    # The other rules require that the piece moves like the object.
     neighbour_m = float(np.median(np.concatenate([piece.near_m[i] for i in common])))
     tolerance_m = max(_DRIFT_M, neighbour_m)
     positions = piece.track.place(piece.in_object(piece.track, common), middle_s)
-    near_middle = [i for i in common if space.clock.near(i, middle, _COMPARED_S)]
-    ends_s = space.clock.time_s[[near_middle[0], near_middle[-1]]]
+    compared = [i for i in common if space.clock.near(i, middle, _COMPARED_S)]
+    ends_s = space.clock.time_s[[compared[0], compared[-1]]]
     tracks = piece.track, moving_object.track
     if not _move_alike(tracks, positions, middle_s, ends_s, tolerance_m):
         return False
+    # Rule 2: it also touches the object in most common sweeps.
     if is_touching:
-        return True  # rule 2
-
-    gap_m = _gap_in_lane_m(positions, moving_object, middle_s)
-    if gap_m > _BUMPERS_M:
-        return False
-    if gap_m <= tolerance_m:
         return True
-    # A larger gap may be a part without returns. Between two vehicles it is seen through.
-    in_object = moving_object.track.undo(positions, middle_s)
-    return not _is_seen_between(in_object, moving_object, common, space)
+    # Rule 3: it is in the object's lane, ahead or behind, without a gap that shows two vehicles. A
+    # gap of up to 1.5 m may be a part without returns. Between two vehicles it is seen through.
+    gap_m = _gap_in_lane_m(positions, moving_object, middle_s)
+    if tolerance_m < gap_m <= _BUMPERS_M:
+        in_object = moving_object.track.undo(positions, middle_s)
+        return not _is_seen_between(in_object, moving_object, common, space)
+    return gap_m <= min(tolerance_m, _BUMPERS_M)
 
 
 def _is_away(piece: _Piece, moving_object: MovingObject, i: int) -> bool:

@@ -41,7 +41,7 @@ class Places(NamedTuple):
     num_free: int  # number of positions in observed free space
 
     def add(self, is_occupied: Bool, is_free: Bool) -> Places:
-        """Return the counts with those of more positions, given as masks."""
+        """Return the counts with those of more positions (P,), occupied or free by two masks."""
         return Places(
             self.num_occupied + int(is_occupied.sum()), self.num_free + int(is_free.sum())
         )
@@ -76,32 +76,31 @@ class Evidence(NamedTuple):
         ``travelled``, ``rough`` and ``slender`` describe path and shape. ``taken`` and ``taken
         too`` tell if positions that a moving object vacates hold something else.
         """
-        static, moved, tests = self.violations
-        less_occupied, more_occupied = sorted(
-            [self.before.log_occupied(), self.after.log_occupied()]
-        )
+        num_static, num_moved, num_tests = self.violations
+        num_removed = max(num_static - num_moved, 0)  # violations that the motion explains
+        # Log odds that a position of the object holds something else before it arrives there, and
+        # after it leaves. The greater has less weight: the rest of a long object may be there.
+        occupied = self.before.log_occupied(), self.after.log_occupied()
         return {
-            # Number of violations that the motion removes, as a share of the tests
-            "removed": float(np.log((max(static - moved, 0) + 1) / (tests + 1))),
-            # Number of violations that the motion leaves, as a share of those of a static object
-            "left": float(np.log((moved + _PRIOR_COUNT) / (static + _PRIOR_COUNT))),
+            # Violations that the motion removes, as a share of the tests; 1 avoids log(0)
+            "removed": float(np.log((num_removed + 1) / (num_tests + 1))),
+            # Violations that remain with the motion, as a share of those of the static track
+            "left": float(np.log((num_moved + _PRIOR_COUNT) / (num_static + _PRIOR_COUNT))),
             # Distance that the object travels; the constant keeps the logarithm finite
             "travelled": float(np.log(self.distance + _MIN_ROUGHNESS)),
             # Scatter of the states about the smooth path
             "rough": float(np.log(self.roughness + _MIN_ROUGHNESS)),
-            # The lesser of two log odds that positions of the object hold something else: before it
-            # arrives there, and after it leaves
-            "taken": less_occupied,
-            # The greater of the two. It has less weight, because the rest of a long object may be
-            # there.
-            "taken too": more_occupied,
-            # Length relative to height
+            "taken": min(occupied),
+            "taken too": max(occupied),
+            # Length relative to height. The square leaves objects about as long as high almost
+            # untouched, and counts against long guard rails.
             "slender": float(np.log(self.slenderness) ** 2),
         }
 
-    def log_odds(self, table: Mapping[str, float]) -> float:
-        """Return the log odds that the track moves, by the table of `fitted_weights`."""
-        return sum(table[name] * value for name, value in self.terms().items()) - table["price"]
+    def log_odds(self, weights: Mapping[str, float]) -> float:
+        """Return the log odds that the track moves, by weights as those of `fitted_weights`."""
+        terms = self.terms().items()
+        return sum(weights[name] * value for name, value in terms) - weights["price"]
 
 
 class Verdict(NamedTuple):
@@ -132,26 +131,26 @@ def judge(
     Args:
         obstacles: Points above the ground of each sweep of the stretch.
         objects: Objects confirmed so far. Their returns do not count against the track.
-        record: Called with the track and its evidence.
+        record: Called with the track and its evidence, unless it has fewer than 3 observations.
     """
     if len(track.observations) < _NUM_STATES:
         return Verdict(-np.inf, -np.inf)
     violations = count_violations(track, obstacles, space)
-    within_m = near_m(space.gap_m(track.centre, next(iter(track.claimed))))
-    best_case = Places(0, violations.tests)
+    neighbour_m = near_m(space.gap_m(track.centre, next(iter(track.claimed))))
+    # Observations at vacated positions cost most time. At first all are assumed to be free, which
+    # favours motion. They are counted only if the other terms do not reject the track even then.
+    all_free = Places(num_occupied=0, num_free=violations.tests)
     evidence = Evidence(
-        violations,
-        best_case,
-        best_case,
-        track.path.travelled_m() / within_m,
-        track.path.residual_m / within_m,
-        _slenderness(track, obstacles, within_m),
+        violations=violations,
+        before=all_free,
+        after=all_free,
+        distance=track.path.travelled_m() / neighbour_m,
+        roughness=track.path.residual_m / neighbour_m,
+        slenderness=_slenderness(track, obstacles, neighbour_m),
     )
-    # Observations at vacated positions cost most time. So far they are assumed to favour motion.
-    # They are skipped if the other terms reject the track even then.
     weights = fitted_weights()
     if record is not None or evidence.log_odds(weights) > 0:
-        before, after = count_vacated_places(track, obstacles, space, objects, within_m)
+        before, after = count_vacated_places(track, obstacles, space, objects, neighbour_m)
         evidence = evidence._replace(before=before, after=after)
     if record is not None:
         record(track, evidence)
@@ -160,7 +159,10 @@ def judge(
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
-    """Count how often other sweeps see through sampled track points, as static and as moved."""
+    """Count how often other sweeps see through sampled points of a track, as static and as moved.
+
+    At most 60 points of each batch are tested, by the first sweep of each other batch in reach.
+    """
     # Sample at most 60 points of each batch, by sweep index.
     tested_rows = {}
     for batch in space.batches:
@@ -194,7 +196,7 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
     return Violations(static, moved, num_tests)
 
 
-def _slenderness(track: Track, obstacles: Sequence[Obstacles], within_m: float) -> float:
+def _slenderness(track: Track, obstacles: Sequence[Obstacles], neighbour_m: float) -> float:
     """Return the extent of the points along their motion divided by their height, at least 1."""
     # A long, low guard rail shows no motion along itself, and is seen through between two rings.
     points = track.points_in(obstacles, track.claimed)
@@ -202,7 +204,7 @@ def _slenderness(track: Track, obstacles: Sequence[Obstacles], within_m: float) 
     length_m = float(np.ptp(points[:, :2] @ motion)) / max(float(np.hypot(*motion)), 1e-9)
     height_m = float(np.ptp(points[:, 2]))
     # The height is known to the neighbour distance only, which also avoids a division by 0.
-    return max(1.0, length_m / (height_m + within_m))
+    return max(1.0, length_m / (height_m + neighbour_m))
 
 
 def count_vacated_places(
@@ -276,5 +278,4 @@ def _returns_near(
 @cache
 def fitted_weights() -> Mapping[str, float]:
     """Return the fitted weight of each term by its name, and the ``price``."""
-    weights: Mapping[str, float] = read_json(_FILE)["weights"]
-    return weights
+    return read_json(_FILE)["weights"]

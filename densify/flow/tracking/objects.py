@@ -24,7 +24,7 @@ from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _KNOT_S = 0.1
-# (Noise of a state / (jerk · knot³))² for a noise of 3 cm and a jerk of 0.03 and 10 m/s³.
+# Weights of the penalty: (noise of a state / (jerk · knot³))², noise 3 cm, jerk 0.03 and 10 m/s³
 _STIFFNESSES = (1e6, 10.0)
 _MAX_ERROR_RATIO = 0.8  # greatest leave-one-out error of a softer path, by that of a stiffer one
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
@@ -64,37 +64,34 @@ class Path:
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
         duration_s = end_s - begin_s
         num_spans = max(1, round(duration_s / _KNOT_S))
-        # B: (m,n) values of n B-splines at the times. Four are above 0 in the span of a time.
-        at_span = (times_s - begin_s) * (num_spans / duration_s)
-        span = np.minimum(at_span.astype(np.int64), num_spans - 1)  # the end is in the last span
-        powers = (at_span - span)[:, None] ** np.arange(_DEGREE, -1, -1)
-        B = np.zeros((num_states, num_spans + _DEGREE))
-        np.put_along_axis(B, span[:, None] + np.arange(_DEGREE + 1), powers @ _CUBIC, axis=1)
-        # D: differences of the coefficients, whose squares are penalised. Third differences are 0
-        # at constant acceleration, second differences at constant velocity.
+        basis = _basis((times_s - begin_s) * (num_spans / duration_s), num_spans)
+        # The penalty is the sum of the squared third differences of the coefficients, which are 0
+        # at constant acceleration, or of the second differences, 0 at constant velocity.
         may_accelerate = num_states >= MIN_STATES and duration_s >= MIN_SPAN_S
-        D = np.diff(np.eye(B.shape[1]), 3 if may_accelerate else 2, axis=0)
-        W = weights / weights.mean()
+        difference = np.diff(np.eye(basis.shape[1]), 3 if may_accelerate else 2, axis=0)
+        penalty = difference.T @ difference
+        state_weight = weights / weights.mean()
         may_jerk = num_states >= _JERK_STATES and duration_s >= _JERK_S
         stiffnesses = _STIFFNESSES if may_jerk else _STIFFNESSES[:1]
 
         least_error_m = residual_m = np.inf
         coefficients = np.zeros(0)
         for stiffness in stiffnesses:
-            # Linear map from the states to the coefficients of the penalised fit
-            fit_matrix = np.linalg.solve(B.T @ (W[:, None] * B) + stiffness * D.T @ D, B.T * W)
+            # Linear map from the states to the coefficients of the penalised least-squares fit
+            weighted_basis = state_weight[:, None] * basis
+            fit_matrix = np.linalg.solve(
+                basis.T @ weighted_basis + stiffness * penalty, basis.T * state_weight
+            )
             trial = fit_matrix @ states
-            # The diagonal of the map from the states to the fitted states. A state's deviation from
-            # the fit without this state is its deviation / (1 - leverage).
-            leverage = np.einsum("ij,ji->i", B, fit_matrix)
-            deviation_m = np.linalg.norm((states - B @ trial)[:, :2], axis=1)
-            left_out_m = deviation_m / np.maximum(1 - leverage, 1e-3)
-            error_m = float(np.sqrt(np.average(left_out_m**2, weights=W)))
+            # The diagonal of the map from the states to the fitted states
+            leverage = np.einsum("ij,ji->i", basis, fit_matrix)
+            deviation_m = np.linalg.norm((states - basis @ trial)[:, :2], axis=1)
+            error_m = _leave_one_out_error_m(deviation_m, leverage, state_weight)
             if error_m < _MAX_ERROR_RATIO * least_error_m:
                 # The leverages sum to the number of fitted parameters. Half a degree of freedom
                 # remains at least.
                 freedom = max(num_states - leverage.sum() - 0.5, 0.5)
-                mean_square = float(np.average(deviation_m**2, weights=W))
+                mean_square = float(np.average(deviation_m**2, weights=state_weight))
                 residual_m = float(np.sqrt(mean_square * num_states / freedom))
                 least_error_m = error_m
                 coefficients = trial
@@ -102,25 +99,27 @@ class Path:
 
     @cached_property
     def _pieces(self) -> tuple[Float, Float]:
-        """Begins (P,) of the pieces, s, and their polynomials (4,P,d); the ends are tangents."""
+        """Begins (P,), s, of the pieces of the path, and their cubic polynomials (4,P,d)."""
         num_spans = len(self.coefficients) - _DEGREE
-        width_s = (self.end_s - self.begin_s) / num_spans
-        # Span k is a cubic polynomial of the coefficients k to k + 3.
+        span_s = (self.end_s - self.begin_s) / num_spans
+        # Span k is a cubic polynomial of the coefficients k to k + 3. Its rows are the powers 3 to
+        # 0 of the time since the span began, in units of a span.
         controls = np.stack([self.coefficients[k : k + num_spans] for k in range(_DEGREE + 1)])
-        cubic = np.einsum("pk,knd->pnd", _CUBIC, controls)
-        # Rows are the powers 3 to 0 of the time since the piece began, in units of a span.
-        linear, constant = 2, 3
-        first, last = np.zeros((2, _DEGREE + 1, 1, cubic.shape[2]))
-        # The first piece begins one span before the path, and ends with its value and slope.
-        first[linear] = cubic[linear, :1]
-        first[constant] = cubic[constant, :1] - first[linear]
-        # The last piece begins with the value and the slope at the end of the path.
-        last[constant] = cubic[:, -1:].sum(axis=0)
-        last[linear] = np.arange(3.0, -1.0, -1) @ cubic[:, -1]  # derivative of the powers, at 1
+        spans = np.einsum("pk,knd->pnd", _CUBIC, controls)
+        # Outside the spans the path continues as a straight line, a piece at either end.
+        linear, constant = 2, 3  # rows of the powers 1 and 0
+        before, after = np.zeros((2, _DEGREE + 1, 1, spans.shape[2]))
+        # The piece before begins one span early, hence its value there is one slope lower.
+        before[linear] = spans[linear, :1]
+        before[constant] = spans[constant, :1] - before[linear]
+        # The piece after begins with value and slope of the last span at time 1: there all powers
+        # are 1, and their derivatives are 3, 2, 1 and 0.
+        after[constant] = spans[:, -1:].sum(axis=0)
+        after[linear] = np.arange(3.0, -1.0, -1) @ spans[:, -1]
         # From units of a span to seconds
-        powers = width_s ** -np.arange(_DEGREE, -1.0, -1)
-        pieces = np.concatenate([first, cubic, last], axis=1) * powers[:, None, None]
-        return self.begin_s + width_s * np.arange(-1.0, num_spans + 1), pieces
+        per_second = span_s ** -np.arange(_DEGREE, -1.0, -1)
+        pieces = np.concatenate([before, spans, after], axis=1) * per_second[:, None, None]
+        return self.begin_s + span_s * np.arange(-1.0, num_spans + 1), pieces
 
     def _piece_at(self, time_s: float | Float) -> tuple[Float, Float]:
         """Return the polynomials (4,...,d) at times (...), and times (...,1) since they begin."""
@@ -131,18 +130,34 @@ class Path:
     def __call__(self, time_s: float | Float) -> Float:
         """Return the states (..., d) at the given times (...) in seconds."""
         (cubic, square, linear, constant), since_s = self._piece_at(time_s)
-        state: Float = ((cubic * since_s + square) * since_s + linear) * since_s + constant
-        return state
+        return ((cubic * since_s + square) * since_s + linear) * since_s + constant
 
     def rate(self, time_s: float | Float) -> Float:
         """Return the derivatives (..., d) of the states per second at the given times (...)."""
         (cubic, square, linear, _), since_s = self._piece_at(time_s)
-        rate: Float = (3 * cubic * since_s + 2 * square) * since_s + linear
-        return rate
+        return (3 * cubic * since_s + 2 * square) * since_s + linear
 
     def travelled_m(self) -> float:
         """Return the horizontal distance between the first and the last position of the fit."""
         return float(np.linalg.norm((self(self.end_s) - self(self.begin_s))[:2]))
+
+
+def _basis(at_span: Float, num_spans: int) -> Float:
+    """Return the (m,n) values of n = num_spans + 3 B-splines at times (m,) in units of a span."""
+    span = np.minimum(at_span.astype(np.int64), num_spans - 1)  # the end is in the last span
+    powers = (at_span - span)[:, None] ** np.arange(_DEGREE, -1, -1)
+    basis = np.zeros((len(at_span), num_spans + _DEGREE))
+    # The four B-splines that are above 0 on a span have the numbers of the span and the next three.
+    np.put_along_axis(basis, span[:, None] + np.arange(_DEGREE + 1), powers @ _CUBIC, axis=1)
+    return basis
+
+
+def _leave_one_out_error_m(deviation_m: Float, leverage: Float, state_weight: Float) -> float:
+    """Return the weighted RMS deviation (m) of each state from the fit to the other states."""
+    # In closed form, without further fits. Without the limit the only state that determines a
+    # parameter (leverage 1) would give 0 / 0.
+    left_out_m = deviation_m / np.maximum(1 - leverage, 1e-3)
+    return float(np.sqrt(np.average(left_out_m**2, weights=state_weight)))
 
 
 # Neighbour distance: least one, for noise and errors of registration, and share of the ring gap
@@ -161,7 +176,7 @@ _SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
 
 
 def near_m(gap_m: Float | float) -> Any:
-    """Return the neighbour distance: how far apart (m) returns of one spot are, by the ring gap."""
+    """Return the neighbour distance (m): half the ring gap ``gap_m``, but at least 0.2 m."""
     return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
 
 
@@ -215,15 +230,15 @@ class Track:
         self.path = Path.fit(times_s, states, weights)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
-        """Move (N,3) points from the object's frame to the world at a time or (N,) times."""
+        """Move (N,3) points from the object's frame to the world at a time (s) or (N,) times."""
         return apply(self.path(time_s), points, self.centre)
 
     def undo(self, points: Float, time_s: float | Float) -> Float:
-        """Move (N,3) points from the world at a time, or at (N,) times, to the object's frame."""
+        """Move (N,3) points from the world at a time (s), or (N,) times, to the object's frame."""
         return undo(self.path(time_s), points, self.centre)
 
     def carry(self, points: Float, from_s: float | Float, to_s: float | Float) -> Float:
-        """Move (N,3) world points along with the object from one time to another."""
+        """Move (N,3) world points with the object from one time to another, or (N,) times each."""
         return self.place(self.undo(points, from_s), to_s)
 
     def velocity_m_s(self, points: Float, time_s: float) -> Float:
@@ -263,10 +278,6 @@ class Track:
     def total_points(self) -> int:
         """Return the number of the object's points in all sweeps."""
         return sum(map(len, self.claimed.values()))
-
-    def duration_s(self) -> float:
-        """Return the time between the first and the last observation."""
-        return float(np.ptp([seen.seen_s for seen in self.observations.values()]))
 
     def rise_m(self, ground: HeightMap, state: Float) -> float:
         """Return how much (m) the ground rises from the first position to that of a state (4,)."""
@@ -314,11 +325,10 @@ class Shape:
         """Return (N,) True for points (N,3, object's frame) inside the outline, seen from above."""
         if not len(self.edges):
             return np.zeros(len(points), bool)
-        inside: Bool = (points[:, :2] @ self.edges[:, :2].T + self.edges[:, 2] < _OUTLINE_M).all(1)
-        return inside
+        return (points[:, :2] @ self.edges[:, :2].T + self.edges[:, 2] < _OUTLINE_M).all(1)
 
     def near(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for points (N,3, object's frame) near the object or in its outline."""
+        """Return (N,) True for points (N,3, object's frame) within ``within_m`` or the outline."""
         return is_near(self.tree, points, within_m) | self.within_outline(points)
 
     @cached_property
@@ -351,7 +361,10 @@ class MovingObject(NamedTuple):
     shape: Shape
 
     def may_be_near(self, points: Float, time_s: float | Float, within_m: float) -> bool:
-        """Return False if the boxes around the object and (N,3) world points are apart."""
+        """Return False if the boxes around the object and (N,3) world points are apart.
+
+        Then no point, measured at the time or (N,) times ``time_s``, is within ``within_m`` of it.
+        """
         # The object is placed at the mean time. Its motion until the other times widens the box.
         at_s = float(np.mean(time_s))
         travel_m = float(np.ptp(time_s) * np.linalg.norm(self.track.path.rate(at_s)[:2]))
