@@ -195,8 +195,8 @@ def _summary(result: Result) -> str:
         ]
         if None not in found:
             lines.append(
-                f"{name}, outliers against exact truth: {percent(found[0])} of the measured pixels, "
-                f"{percent(found[1])} with filled ones"
+                f"{name}, outliers against exact truth: {percent(found[0])} of the measured "
+                f"pixels, {percent(found[1])} with filled ones"
             )
     if ghosts := _beside_icp(result, "ghosts", "all"):
         lines.append(f"ghosts of the accumulated points: {ghosts}")
