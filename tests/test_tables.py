@@ -48,4 +48,9 @@ def test_costs_are_links_to_their_table(name: str) -> None:
 
 def test_a_share_of_few_pixels_is_no_figure(maker: Any) -> None:
     cell = {"num_compared": 199, "coverage": 0.01, "outliers": 0.0, "mae_m": 0.1}
-    assert maker.all_errors(cell) == maker.share(cell, None) == "–"
+    methods = {method: {"all": cell | {"num_pixels": 300}} for method in maker.METHODS}
+    assert maker.share(cell, None) == "–"
+    assert (
+        maker.rows_of_parts("street, exact", methods, "mean absolute error in m")[0][1:]
+        == ["–"] * 6
+    )
