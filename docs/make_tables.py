@@ -30,9 +30,13 @@ MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 MEASURED = ("single sweep", "rigid (ICP)", "densify, measured")
 FILLED = ("single sweep, filled", "single sweep, IP-Basic", "densify, filled")
 METHODS = (*MEASURED, *FILLED)
-TITLES = (
-    *("single sweep", "rigid (ICP)", "densify"),
-    *("single sweep filled", "IP-Basic", "densify filled"),
+TITLES = dict(
+    zip(
+        METHODS,
+        ("single sweep", "rigid (ICP)", "densify measured")
+        + ("single sweep filled", "IP-Basic", "densify filled"),
+        strict=True,
+    )
 )
 TRUTHS = {
     "KITTI, stereo": ("KITTI, 1 image, stereo truth", ["0013@10"]),
@@ -49,39 +53,52 @@ def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([head, "|" + "---|" * len(titles), *body])
 
 
-def share(cell: Any, stored: gate.Stored, keys: Sequence[str] = (), figure: str = "") -> str:
+def share(
+    cell: Any, stored: gate.Stored | None, keys: Sequence[str] = (), figure: str = ""
+) -> str:
     """Return outliers in %, with the luck of a figure of the gate's keys, and coverage."""
     if cell["num_compared"] < LEAST_PIXELS:
         return "–"
     outliers, covered = 100 * cell["outliers"], f"({cell['coverage']:.2f})"
-    if not keys:
+    if not keys or stored is None:
         return f"{outliers:.{1 if outliers >= 10 else 2}f} {covered}"
     luck = math.hypot(*(stored.luck[key][f"{figure} outliers"] for key in keys)) / len(keys)
     return f"{outliers:.2f} ± {luck:.2f} {covered}"
 
 
 def with_best(texts: Mapping[str, str]) -> list[str]:
-    """Return the cells of all methods, in bold the least of the measured and of the filled maps."""
+    """Return the texts of methods, in bold the least of the measured and of the filled maps."""
     best = {}
     for group in (MEASURED, FILLED):
-        numbers = {method: texts[method].split()[0] for method in group if texts[method] != "–"}
+        numbers = {m: texts[m].split()[0] for m in group if texts.get(m, "–") != "–"}
         least = min(map(float, numbers.values()), default=0.0)
         best |= {method: number for method, number in numbers.items() if float(number) == least}
-    return [re.sub(r"^\S+", r"**\g<0>**", texts[m]) if m in best else texts[m] for m in METHODS]
+    return [re.sub(r"^\S+", r"**\g<0>**", text) if m in best else text for m, text in texts.items()]
 
 
 def comparison(errors: Any, stored: gate.Stored) -> str:
     """Return the table of all methods."""
+    return rows_of_truths(errors, METHODS, stored)
+
+
+def headline(errors: Any, stored: gate.Stored) -> str:
+    """Return the table of the README, without the single sweep as measured and without luck."""
+    return rows_of_truths(errors, METHODS[1:], None)
+
+
+def rows_of_truths(errors: Any, methods: Sequence[str], stored: gate.Stored | None) -> str:
+    """Return a table of outliers and coverage, with luck if the gate's figures are given."""
     rows = []
     for truth, (label, keys) in TRUTHS.items():
         for part in ("all", "moving"):
-            cells = {method: errors[truth][method][part] for method in METHODS}
-            texts = {method: share(cell, stored) for method, cell in cells.items()}
-            for method in (MEASURED[-1], FILLED[-1]):
-                texts[method] = share(cells[method], stored, keys, f"{method[9:]} {part}")
-            title = label if part == "all" else "its moving pixels"
-            rows.append([title, *with_best(texts)])
-    return table(["outliers in % (coverage)", *TITLES], rows)
+            texts = {}
+            for method in methods:
+                kind = method.removeprefix("densify, ")
+                has_luck = kind != method and stored is not None
+                luck = (keys, f"{kind} {part}") if has_luck else ()
+                texts[method] = share(errors[truth][method][part], stored, *luck)
+            rows.append([label if part == "all" else "its moving pixels", *with_best(texts)])
+    return table(["outliers in % (coverage)", *(TITLES[m] for m in methods)], rows)
 
 
 def judged(errors: Any, stored: gate.Stored) -> str:
@@ -129,7 +146,7 @@ def baselines(errors: Any, stored: gate.Stored) -> str:
         blocks.append(f"## {title}")
         for error in ERRORS:
             rows = rows_of_parts(truth, errors[truth], error)
-            blocks.append(table([error, *TITLES], rows))
+            blocks.append(table([error, *TITLES.values()], rows))
     return "\n" + "\n\n".join(blocks) + "\n"
 
 
@@ -152,7 +169,7 @@ def rows_of_parts(truth: str, methods: Any, error: str) -> list[list[str]]:
 def with_tables(page: str) -> str:
     """Return the text of a page with its tables made again."""
     numbers, stored = json.loads(NUMBERS.read_text()), gate.read(ROOT / "tests/gate.json")
-    makers = {f.__name__: f for f in (comparison, judged, baselines)}
+    makers = {f.__name__: f for f in (headline, comparison, judged, baselines)}
 
     def made(found: re.Match[str]) -> str:
         if found[2] == "cost":
