@@ -53,9 +53,7 @@ def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([head, "|" + "---|" * len(titles), *body])
 
 
-def share(
-    cell: Any, stored: gate.Stored | None, keys: Sequence[str] = (), figure: str = ""
-) -> str:
+def share(cell: Any, stored: gate.Stored | None, keys: Sequence[str] = (), figure: str = "") -> str:
     """Return outliers in %, with the luck of a figure of the gate's keys, and coverage."""
     if cell["num_compared"] < LEAST_PIXELS:
         return "–"
