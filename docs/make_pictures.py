@@ -3,9 +3,9 @@
 
 python docs/make_pictures.py [NAME…] [--pandaset DIR] [--runs DIR]
 
-NAME: pandaset, street, how, reports, paper, notebook (default: all). Each key is densified once,
-into RUNS (default: ./densify-out/pictures). Finished runs there are drawn again as they are.
-pandaset needs --pandaset, the folder of sequence 002.
+NAME: pandaset, street, how, set, reports, paper, notebook (default: all). Each key is densified
+once, into RUNS (default: ./densify-out/pictures). Finished runs there are drawn again as they are.
+pandaset needs --pandaset, the folder of sequence 002; set needs Chromium.
 """
 
 from __future__ import annotations
@@ -320,6 +320,23 @@ def make_how(runs: Path, pandaset: Path | None) -> None:
     write("how-hull", explained_scene.hull_picture(found, *maps))
 
 
+def make_set(runs: Path, pandaset: Path | None) -> None:
+    """Draw the top of the page of a training set, as a browser shows it."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        raise SystemExit("set: chromium: not found; expected a browser that takes screenshots")
+    folder, screenshot = (runs / "street-dense").resolve(), (runs / "set.png").resolve()
+    options = ["--keys", "110:126", "--camera", "image_02", "--set", "output.score=true"]
+    if densify(["dataset", "street", *options, "--workers", "1", "--out", str(folder)]):
+        raise SystemExit("densify dataset failed; its message is above")
+    if densify(["report", str(folder), "--overwrite"]):
+        raise SystemExit("densify report failed; its message is above")
+    command = [browser, "--headless", "--no-sandbox", "--hide-scrollbars"]
+    command += [f"--screenshot={screenshot}", "--window-size=1200,1150"]
+    subprocess.run([*command, (folder / "report.html").as_uri()], check=True)
+    write("set", np.asarray(Image.open(screenshot).convert("RGB")))
+
+
 def make_reports(runs: Path, pandaset: Path | None) -> None:
     """Write two pages to turn around, with fewer points than `densify report` has."""
     report_page._MOST_POINTS = REPORT_POINTS
@@ -384,6 +401,7 @@ MAKERS = {
     "pandaset": make_pandaset,
     "street": make_street,
     "how": make_how,
+    "set": make_set,
     "reports": make_reports,
     "paper": make_paper,
     "notebook": make_notebook,

@@ -3,7 +3,7 @@
 
 python docs/make_tables.py [FILE]
 
-FILE, printed by ``densify bench baselines --json``, replaces the errors in docs/numbers.json. Costs
+FILE, printed by ``densify bench baselines --json``, replaces errors in docs/numbers.json. Costs
 are entered there by hand. ``densify bench gate --write`` writes tests/gate.json. A table stands
 between ``<!-- table: NAME -->`` and ``<!-- end -->``. Prose quotes a figure as a link to its table.
 """
@@ -14,7 +14,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +27,23 @@ NUMBERS = ROOT / "docs/numbers.json"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 FIGURES = ("num_pixels", "num_compared", "coverage", "outliers", "outliers_1_px", "mae_m")
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-SIMPLER = ("single sweep", "single sweep, filled", "single sweep, IP-Basic", "rigid (ICP)")
-OURS = ("densify, measured", "densify, filled")
+MEASURED = ("single sweep", "rigid (ICP)", "densify, measured")
+FILLED = ("single sweep, filled", "single sweep, IP-Basic", "densify, filled")
+METHODS = (*MEASURED, *FILLED)
+TITLES = dict(
+    zip(
+        METHODS,
+        ("single sweep", "rigid (ICP)", "densify measured")
+        + ("single sweep filled", "IP-Basic", "densify filled"),
+        strict=True,
+    )
+)
 TRUTHS = {
-    "KITTI, stereo": ("KITTI", ["0013@10"]),
-    "PandaSet, second scanner": ("PandaSet", [f"pandaset/002@{k}" for k in (15, 17, 19)]),
-    "street, exact": ("street", []),
+    "KITTI, stereo": ("KITTI, 1 image, stereo truth", ["0013@10"]),
+    "PandaSet, second scanner": ("PandaSet, 3 images, second scanner", []),
+    "street, exact": ("street, 1 image, exact truth", ["street?seed=301@60"]),
 }
-"""Truth -> its short name, and the keys of the gate that have it."""
+"""Truth -> its title, and the keys of the gate that have its luck."""
 
 
 def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -44,28 +53,50 @@ def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([head, "|" + "---|" * len(titles), *body])
 
 
-def share(cell: Any, stored: gate.Stored, keys: Sequence[str] = (), figure: str = "") -> str:
-    """Return outliers, with the luck of a figure of the gate's keys, and coverage."""
+def share(cell: Any, stored: gate.Stored | None, keys: Sequence[str] = (), figure: str = "") -> str:
+    """Return outliers in %, with the luck of a figure of the gate's keys, and coverage."""
     if cell["num_compared"] < LEAST_PIXELS:
         return "–"
     outliers, covered = 100 * cell["outliers"], f"({cell['coverage']:.2f})"
-    if not keys:
-        return f"{outliers:.{1 if outliers >= 10 else 2}f} % {covered}"
+    if not keys or stored is None:
+        return f"{outliers:.{1 if outliers >= 10 else 2}f} {covered}"
     luck = math.hypot(*(stored.luck[key][f"{figure} outliers"] for key in keys)) / len(keys)
-    return f"{outliers:.2f} ± {luck:.2f} % {covered}"
+    return f"{outliers:.2f} ± {luck:.2f} {covered}"
+
+
+def with_best(texts: Mapping[str, str]) -> list[str]:
+    """Return the texts of methods, in bold the least of the measured and of the filled maps."""
+    best = {}
+    for group in (MEASURED, FILLED):
+        numbers = {m: texts[m].split()[0] for m in group if texts.get(m, "–") != "–"}
+        least = min(map(float, numbers.values()), default=0.0)
+        best |= {method: number for method, number in numbers.items() if float(number) == least}
+    return [re.sub(r"^\S+", r"**\g<0>**", text) if m in best else text for m, text in texts.items()]
 
 
 def comparison(errors: Any, stored: gate.Stored) -> str:
     """Return the table of all methods."""
+    return rows_of_truths(errors, METHODS, stored)
+
+
+def headline(errors: Any, stored: gate.Stored) -> str:
+    """Return the table of the README, without the single sweep as measured and without luck."""
+    return rows_of_truths(errors, METHODS[1:], None)
+
+
+def rows_of_truths(errors: Any, methods: Sequence[str], stored: gate.Stored | None) -> str:
+    """Return a table of outliers and coverage, with luck if the gate's figures are given."""
     rows = []
-    for truth, (_, keys) in TRUTHS.items():
-        for part, label in (("all", f"{truth} truth, all"), ("moving", "the same, moving")):
-            cells = {method: parts[part] for method, parts in errors[truth].items()}
-            single, filled, basic, rigid = (share(cells[m], stored) for m in SIMPLER)
-            ours = [share(cells[m], stored, keys, f"{m[9:]} {part}") for m in OURS]
-            rows.append([label, single, f"{filled}; {basic}", rigid, *ours])
-    filled = "filled (ours; IP-Basic)"
-    return table(["scored against", "single sweep", filled, "rigid (ICP)", *OURS], rows)
+    for truth, (label, keys) in TRUTHS.items():
+        for part in ("all", "moving"):
+            texts = {}
+            for method in methods:
+                kind = method.removeprefix("densify, ")
+                has_luck = kind != method and stored is not None
+                luck = (keys, f"{kind} {part}") if has_luck else ()
+                texts[method] = share(errors[truth][method][part], stored, *luck)
+            rows.append([label if part == "all" else "its moving pixels", *with_best(texts)])
+    return table(["outliers in % (coverage)", *(TITLES[m] for m in methods)], rows)
 
 
 def judged(errors: Any, stored: gate.Stored) -> str:
@@ -84,7 +115,7 @@ def judged(errors: Any, stored: gate.Stored) -> str:
         [label, *(of_gate(stored, keys, figure) for figure in figures), *[""] * (3 - len(figures))]
         for label, (keys, figures) in rows.items()
     ]
-    return table(["", "measured", "filled", "moving, filled"], cells)
+    return table(["outliers in % (coverage)", "measured", "filled", "moving, filled"], cells)
 
 
 def of_gate(stored: gate.Stored, keys: Sequence[str], figure: str) -> str:
@@ -96,33 +127,47 @@ def of_gate(stored: gate.Stored, keys: Sequence[str], figure: str) -> str:
     return share(cell, stored, keys, figure)
 
 
+ERRORS: dict[str, Callable[[Any], str]] = {
+    "outliers over 3 px in % (coverage)": lambda cell: (
+        f"{100 * cell['outliers']:.2f} ({cell['coverage']:.2f})"
+    ),
+    "outliers over 1 px in %": lambda cell: f"{100 * cell['outliers_1_px']:.2f}",
+    "mean absolute error in m": lambda cell: f"{cell['mae_m']:.2f}",
+}
+"""Title of a table of baselines -> the text of a cell."""
+
+
 def baselines(errors: Any, stored: gate.Stored) -> str:
-    """Return the table of all errors by part of the pixels."""
-    rows = []
-    for truth, methods in errors.items():
-        name = TRUTHS[truth][0]
-        ranges = [p for p in methods[SIMPLER[0]] if name == "KITTI" and "-" in p]
-        for part in ["all", "moving", "static", *ranges, *["edge"] * (name != "PandaSet")]:
-            label = {"all": f"{name}, all", "edge": "discontinuities"}.get(part, part)
-            cells = [methods[method][part] for method in (*SIMPLER, *OURS)]
-            pixels = f"({cells[0]['num_pixels']:,})"
-            rows.append([f"{label.replace('-', ' to ')} {pixels}", *map(all_errors, cells)])
-    titles = ["single sweep", "filled our way", "filled by IP-Basic", "rigid (ICP)", *OURS]
-    return table(["truth, part (true pixels)", *titles], rows)
+    """Return a heading for each truth, and a table for each error, by part of the pixels."""
+    blocks = []
+    for truth, (title, _) in TRUTHS.items():
+        blocks.append(f"## {title}")
+        for error in ERRORS:
+            rows = rows_of_parts(truth, errors[truth], error)
+            blocks.append(table([error, *TITLES.values()], rows))
+    return "\n" + "\n\n".join(blocks) + "\n"
 
 
-def all_errors(cell: Any) -> str:
-    """Return outliers over 3 px and over 1 px, mean absolute error and coverage."""
-    if cell["num_compared"] < LEAST_PIXELS:
-        return "–"
-    shares = f"{100 * cell['outliers']:.2f} / {100 * cell['outliers_1_px']:.2f} %"
-    return f"{shares}, {cell['mae_m']:.2f} m ({cell['coverage']:.2f})"
+def rows_of_parts(truth: str, methods: Any, error: str) -> list[list[str]]:
+    """Return the rows of a table of one error, one for each part of the pixels."""
+    rows, left_out = [], ["not edge"]
+    if truth.startswith("PandaSet"):
+        left_out.append("edge")  # its truth is too sparse to have discontinuities
+    for part, cell in methods[METHODS[0]].items():
+        if cell["num_pixels"] < LEAST_PIXELS or part in left_out:
+            continue
+        cells = {method: methods[method][part] for method in METHODS}
+        has_figure = {m: c["num_compared"] >= LEAST_PIXELS for m, c in cells.items()}
+        texts = {m: ERRORS[error](c) if has_figure[m] else "–" for m, c in cells.items()}
+        label = "discontinuities" if part == "edge" else part.replace("-", " to ")
+        rows.append([f"{label} ({cell['num_pixels']:,})", *with_best(texts)])
+    return rows
 
 
 def with_tables(page: str) -> str:
     """Return the text of a page with its tables made again."""
     numbers, stored = json.loads(NUMBERS.read_text()), gate.read(ROOT / "tests/gate.json")
-    makers = {f.__name__: f for f in (comparison, judged, baselines)}
+    makers = {f.__name__: f for f in (headline, comparison, judged, baselines)}
 
     def made(found: re.Match[str]) -> str:
         if found[2] == "cost":
@@ -138,7 +183,7 @@ def main() -> None:
     """Store the errors that are given, and write the tables of all pages."""
     for name in sys.argv[1:]:
         measured, numbers = json.loads(Path(name).read_text()), json.loads(NUMBERS.read_text())
-        for truth in TRUTHS:
+        for truth in TRUTHS.keys() & measured.keys():
             numbers["baselines"][truth] = {
                 method: {part: {f: cell[f] for f in FIGURES} for part, cell in parts.items()}
                 for method, parts in measured[truth].items()

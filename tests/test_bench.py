@@ -30,7 +30,7 @@ CONFIG = resolve(
         "objective": {"num_neighbors": 10},
     }
 )
-RESULTS = Path(__file__).parents[1] / "docs" / "results.md"
+RESULTS = Path(__file__).parents[1] / "docs" / "flow-results.md"
 
 
 class TwoScanners(TinySequence):

@@ -3,7 +3,7 @@
 
 Errors are those of the flow to the neighbouring sweep towards the key sweep, pooled over the points
 above the ground. Seconds per pair of sweeps cover ground estimation, this flow and the flow to the
-key sweep. ``densify bench readme`` makes the tables of docs/results.md again.
+key sweep. ``densify bench readme`` makes the tables of docs/flow-results.md again.
 """
 
 from __future__ import annotations
@@ -288,7 +288,7 @@ def _motion(stretch: Stretch, config: Config, asked: Sequence[int] | None = None
     return estimate_motion(Scene(stretch, ground(stretch), asked=asked), config)
 
 
-# The tables of docs/results.md
+# The tables of docs/flow-results.md
 
 
 class KeySweep(NamedTuple):

@@ -183,7 +183,7 @@ def _paper_sets(options: argparse.Namespace) -> dict[str, Iterable[paper.PaperPa
 
 
 def answer_bench_readme(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify bench readme``: yield the lines of the tables of docs/results.md."""
+    """Answer ``densify bench readme``: yield the lines of the tables of docs/flow-results.md."""
     with progress_on_stderr() as progress:
         for line in tables(options.table, progress):
             yield Answer(line, {"lines": [line]})

@@ -335,7 +335,8 @@ TRUTH  a PNG or a folder
         "bench baselines",
         "bench",
         "compare simpler maps with ours on real and exact truth",
-        "--data DIR  folder of real recordings (default: $DENSIFY_TEST_DATA; without, the street)",
+        "--data DIR  folder of real recordings, arranged as docs/baselines.md says (default:\n"
+        "    $DENSIFY_TEST_DATA; without, the street)",
         "Methods: the single sweep as measured, filled as densify fills, and filled as IP-Basic "
         "does (Ku et al., CRV 2018); rigid accumulation; densify. Outliers are KITTI's (3 px and "
         "5 %). Shares of fewer than 200 pixels are not shown.",
@@ -345,7 +346,8 @@ TRUTH  a PNG or a folder
         "bench",
         "judge a change: the figures of 16 keys and 3 pairs beside stored ones, with their luck",
         """
---data DIR  folder of the real recordings (default: $DENSIFY_TEST_DATA; without, streets alone)
+--data DIR  folder of the real recordings, arranged as docs/baselines.md says (default:
+    $DENSIFY_TEST_DATA; without, streets alone)
 --only KIND,…  some of depth, flow, registration (default: all)
 --keys NAME,…  some of the keys (default: all)
 --stored FILE =tests/gate.json  stored figures to compare with
@@ -360,7 +362,7 @@ TRUTH  a PNG or a folder
     Verb(
         "bench readme",
         "bench",
-        "make the tables of docs/results.md again, as Markdown on stdout; all take half an hour",
+        "make the tables of docs/flow-results.md as Markdown on stdout; all take half an hour",
         "[TABLE+]  flow, registration (default: all)",
     ),
 )
