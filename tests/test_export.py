@@ -89,7 +89,7 @@ def test_a_form_is_whole_repeatable_and_leaves_the_run_alone(to: str, run: Path)
 @pytest.mark.parametrize("to", PACKAGES)
 def test_a_package_that_is_not_installed_is_named(to: str, run: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, PACKAGES[to], None)
-    refused(f"pip install 'densify-lidar[{EXTRAS.get(to, to)}]'", run=run, to=to)
+    refused(f"pip install '.[{EXTRAS.get(to, to)}]'", run=run, to=to)
 
 
 def test_the_command_and_the_record(run: Path, capsys) -> None:

@@ -186,7 +186,7 @@ _MORE = (
 DIR  {_ONE_RUN}, or of several keys of a drive
 --with {{rerun,open3d}} =rerun  the viewer: rerun, with sweeps over time, or open3d
 {_CAMERA}""",
-        "Needs a screen, and the extra rerun or open3d (pip install 'densify-lidar[rerun]'). "
+        "Needs a screen, and the extra rerun or open3d (pip install '.[rerun]'). "
         "densify report needs only a browser.",
     ),
     Verb(

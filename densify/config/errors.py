@@ -25,8 +25,8 @@ def _cut(text: str, num_characters: int) -> str:
 
 
 def how_to_install(extra: str) -> str:
-    """Return the commands that install an extra, such as ``ros``, of the package densify-lidar."""
-    return f"pip install 'densify-lidar[{extra}]', or in a checkout pip install '.[{extra}]'"
+    """Return the command that installs an extra, such as ``ros``, of this package."""
+    return f"in the checkout of densify: pip install '.[{extra}]'"
 
 
 def did_you_mean(got: str, known: Iterable[str]) -> str:
