@@ -132,7 +132,8 @@ def _set_page(root: Path, command: str = "") -> bytes:
         "state": _state(made, command),
         "verdict": html.escape(_verdict(made)),
         "scores": _table(
-            ("score", "median", "5 to 95 % of keys", "limit", "usual on KITTI"), map(_facts(made), _SCORES)
+            ("score", "median", "5 to 95 % of keys", "limit", "usual on KITTI"),
+            map(_facts(made), _SCORES),
         ),
         "plots": "\n".join(_plot(score, made) for score in made.scores),
         "keys": "\n".join(_card(made, record) for record in pictured),
@@ -172,13 +173,10 @@ def _state(made: _Set, command: str) -> str:
     kind = "Preview" if command else "Not finished"
     num_tried = f"{len(planned & tried):,} of {len(planned):,} keys"
     rest = describe_rest(made.records, num_left) or f"{num_left:,} keys are left"
-    how = (
-        f"<br><code>{html.escape(command)}</code>"
-        if command
-        else ("; run the command that made the set again, without --preview")
-    )
-    later = ". Keys are compared with their neighbours when all are made"
-    return f"<b>{kind}: {num_tried}</b>; {rest}{later}{how}<br>{state}"
+    how = "run the command that made the set again, without --preview"
+    how = f"<code>{html.escape(command)}</code>" if command else how
+    later = "Keys are compared with their neighbours when all are made."
+    return f"<b>{kind}: {num_tried}</b>; {rest}: {how}<br>{state}. {later}"
 
 
 def _verdict(made: _Set) -> str:
