@@ -14,7 +14,7 @@ import pytest
 
 import densify
 from densify.config.errors import InputError
-from densify.dataset.manifest import KeyRecord
+from densify.dataset.manifest import KeyRecord, describe_pace, describe_rest
 from densify.dataset.plan import Recipe, plan, write_plan
 from densify.dataset.report import write_report
 from densify.outputs.kitti_tree import FileRecord
@@ -93,6 +93,13 @@ def test_pictures_show_the_image_filled_depth_and_confidence(described: Path) ->
         (described / "dataset.json").read_text().replace('"data": "', '"data": "/moved')
     )
     assert page_of(described).count("<img") == 2  # the recording is no longer there
+
+
+def test_the_slowest_key_has_no_part_in_the_time_of_the_others() -> None:
+    records = [replace(scored(key), seconds=s) for key, s in enumerate((100.0, 6.0, 12.0, 6.0))]
+    assert describe_pace(records) == "31.0 s a key (6.0 to 100.0)"
+    assert describe_rest(records, 60) == "the other 60 keys take about 6 to 9 min in one process"
+    assert describe_rest(records[:1], 60) == ""
 
 
 def test_a_key_leads_to_its_own_page_and_many_keys_have_a_histogram(described: Path) -> None:

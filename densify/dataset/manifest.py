@@ -125,7 +125,8 @@ def describe_pace(records: Iterable[KeyRecord]) -> str:
     seconds = [record.seconds for record in records]
     if not seconds:
         return ""
-    return f"{np.mean(seconds):.1f} s a key ({min(seconds):.1f} to {max(seconds):.1f})"
+    span = f" ({min(seconds):.1f} to {max(seconds):.1f})" if len(seconds) > 1 else ""
+    return f"{np.mean(seconds):.1f} s a key{span}"
 
 
 def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:
