@@ -106,7 +106,9 @@ class _Set(NamedTuple):
 
 
 def _read_set(root: Path) -> _Set:
-    table, records = read_plan(root) or {}, list(read_manifests(root).values())
+    table = read_plan(root) or {}
+    drives = drives_of(table)
+    records = [record for record in read_manifests(root).values() if record.drive in drives]
     done = [record for record in records if record.status == "done"]
     ranks: dict[tuple[str, int], tuple[float, str]] = {}
     for score in _SCORES:
@@ -116,7 +118,7 @@ def _read_set(root: Path) -> _Set:
             ranks[name] = max(ranks.get(name, (0.0, "")), (rank / len(known), score.name))
     worst_first = sorted(done, key=lambda r: ranks.get(r.name, (0.0, ""))[0], reverse=True)
     worst_score = {name: score for name, (_, score) in ranks.items()}
-    return _Set(root, table, drives_of(table), records, worst_first, worst_score)
+    return _Set(root, table, drives, records, worst_first, worst_score)
 
 
 def _set_page(root: Path, command: str = "") -> bytes:
@@ -155,8 +157,8 @@ def _set_page(root: Path, command: str = "") -> bytes:
 def _pictured(worst_first: Sequence[KeyRecord]) -> list[KeyRecord]:
     """Return the worst keys, then others that are spread evenly over the set."""
     others = sorted(worst_first[_NUM_WORST:], key=lambda record: record.name)
-    step = max(1, len(others) // _NUM_SPREAD)
-    return [*worst_first[:_NUM_WORST], *others[::step][:_NUM_SPREAD]]
+    rows = np.linspace(0, len(others) - 1, min(_NUM_SPREAD, len(others))).astype(int)
+    return [*worst_first[:_NUM_WORST], *(others[row] for row in rows)]
 
 
 def _state(made: _Set, command: str) -> str:
@@ -183,7 +185,7 @@ def _verdict(made: _Set) -> str:
     """Return a sentence that says whether the set is as good as one of KITTI."""
     worse = []
     for score in _SCORES:
-        if (values := made.values(score)) and score.usual and score.is_bad:
+        if (values := made.values(score)) and score.usual:
             bound = score.usual[1] if score.is_bad > 0 else score.usual[0]
             if score.is_bad * (float(np.median(values)) - bound) > 0:
                 worse.append(score.title.lower())
