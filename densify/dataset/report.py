@@ -38,7 +38,7 @@ from densify.outputs.report_page import KeyFiles, key_page
 _NUM_WORST, _NUM_SPREAD = 6, 18  # keys with pictures: the worst, and others spread over the set
 _NUM_ASIDE = 12  # keys with pictures among those put aside
 _NUM_LISTED = 1000  # rows of the table of keys, the worst first
-_NUM_DOTS = 2000  # of a plot, half of them the worst keys
+_NUM_DOTS = 1000  # of a plot, half of them the worst keys
 _QUALITY = 80
 _LEAST_GRAY = 40  # of confidence 0; black is no depth
 _MANY_ASIDE = 0.1  # a greater share of keys put aside or failed is reported in the verdict
@@ -90,11 +90,7 @@ class _Set(NamedTuple):
     records: Sequence[KeyRecord]  # ordered by recording and frame
     worst_first: Sequence[KeyRecord]  # the keys that are done
     worst_score: Mapping[tuple[str, int], str]  # key -> name of the score that ranks it
-
-    @property
-    def scores(self) -> list[_Score]:
-        """The scores that a key of the set has."""
-        return [score for score in _SCORES if any(score.of(r) is not None for r in self.records)]
+    scores: Sequence[_Score]  # the scores that a key of the set has
 
     def values(self, score: _Score) -> list[float]:
         """Return the known values of a score of the keys that are done."""
@@ -118,7 +114,8 @@ def _read_set(root: Path) -> _Set:
             ranks[name] = max(ranks.get(name, (0.0, "")), (rank / len(known), score.name))
     worst_first = sorted(done, key=lambda r: ranks.get(r.name, (0.0, ""))[0], reverse=True)
     worst_score = {name: score for name, (_, score) in ranks.items()}
-    return _Set(root, table, drives, records, worst_first, worst_score)
+    scores = [score for score in _SCORES if any(score.of(r) is not None for r in records)]
+    return _Set(root, table, drives, records, worst_first, worst_score, scores)
 
 
 def _set_page(root: Path, command: str = "") -> bytes:
