@@ -133,7 +133,7 @@ def in_order(out: Path) -> None:
     assert all(n.startswith(".manifest") for n in names if n.startswith("."))
     recorded: set[str] = set().union(*(record.files for record in by_key.values()))
     assert not [name for record in by_key.values() for name in damaged_files(record, out)]
-    about = ("dataset.json", "README.txt", "manifest", "densify", ".")
+    about = ("dataset.json", "README.txt", "report.html", "manifest", "densify", ".")
     assert {name for name in names if not name.startswith(about)} == recorded
     assert len(records(out)) == len(by_key)
 

@@ -355,10 +355,12 @@ def test_arguments_of_python_of_a_wrong_kind() -> None:
         densify.run(street, 120, 1, cameras="image_02")
 
 
-def test_without_a_terminal_progress_is_a_line_every_ten_seconds(monkeypatch, capsys) -> None:
+def test_without_a_terminal_progress_is_a_line_each_ten_seconds_and_at_the_end(
+    monkeypatch, capsys
+) -> None:
     times_s = iter([0.0, 4.0, 11.0, 11.0, 12.0, *[12.0] * 99])
     monkeypatch.setattr("time.monotonic", lambda: next(times_s))
     with progress_on_stderr() as progress:
-        for done in range(3):
+        for done in (0, 1, 2, 9):
             progress("keys", done, 9)
-    assert capsys.readouterr().err == "densify: keys, 1 of 9\n"
+    assert capsys.readouterr().err == "densify: keys, 1 of 9\ndensify: keys, 9 of 9\n"

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
+import shlex
 import shutil
 import signal
 import time
@@ -65,7 +67,8 @@ def test_a_set_is_what_it_says(border_set: Path, capsys) -> None:
         assert record["scores"]["ghost"] < 0.01
         assert record["scores"]["num_moving"] > 100
     assert {p.name for p in border_set.iterdir()} == {
-        *("val", "dataset.json", "manifest.jsonl", ".manifest.lock", "densify.log", "README.txt")
+        *("val", "dataset.json", "manifest.jsonl", ".manifest.lock", "densify.log", "README.txt"),
+        "report.html",
     }
     data = DepthDataset(border_set)
     assert [sample["frame"] for sample in data] == list(FRAMES)
@@ -77,12 +80,19 @@ def test_a_set_is_what_it_says(border_set: Path, capsys) -> None:
 
 
 def test_a_preview_is_a_part_of_the_set(border_drive: Path, tmp_path: Path, capsys) -> None:
-    arguments = ("--data", border_drive, *CHEAP, "--out", tmp_path / "out")
-    assert exit_code("dataset", *arguments, "--preview", "3") == 0
-    shown = capsys.readouterr().out
-    assert keys_of(maps_in(tmp_path / "out")) == set(FRAMES[::3])
-    assert (tmp_path / "out" / "report.html").is_file()
-    assert f"the other {len(FRAMES) - 3} keys take up to" in shown
+    out = tmp_path / "out"
+    arguments = ("dataset", "--data", border_drive, *CHEAP, "--out", out)
+    assert exit_code(*arguments, "--preview", "3") == 0
+    shown, page = capsys.readouterr().out, (out / "report.html").read_text()
+    assert keys_of(maps_in(out)) == set(FRAMES[1::3])  # not the first, whose window is cut
+    command = shlex.join(["densify", *map(str, arguments)])
+    rest = next(line for line in shown.splitlines() if line.startswith("the other 6 keys take"))
+    assert rest.endswith(f": {command}") and "<b>Preview: 3 of 9 keys</b>" in page
+    assert html.escape(command) in page
+    assert exit_code("report", out) == 0  # replaces the page
+    assert exit_code(*arguments) == 0
+    page = (out / "report.html").read_text()
+    assert "9 done" in page and "Preview" not in page
 
 
 def test_shards_workers_and_a_killed_run_make_what_one_makes(

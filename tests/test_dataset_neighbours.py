@@ -57,7 +57,7 @@ def test_outliers_count_by_the_worst_camera_and_only_of_keys_that_are_kept() -> 
     bad = replace(records[DRIVE, 4], scores={"ghost": 0, "outliers": {"a": 0.01, "b": 0.05}})
     records[bad.name] = bad
     ((name, text),) = worse_than_neighbours(records, 4.0).items()
-    assert name == (DRIVE, 4) and "held-out outliers of the neighbouring keys" in text
+    assert name == (DRIVE, 4) and text.startswith("held-out outliers 5 %, more than 4 times the")
     assert "ghosts" not in text
     records[bad.name] = replace(bad, status="aside", reason="outliers")
     assert not worse_than_neighbours(records, 4.0)
@@ -75,11 +75,15 @@ def test_a_key_far_worse_than_its_neighbours_is_put_aside(
 
     monkeypatch.setattr(make, "make_key", made)
     out, cheap = tmp_path / "set", (*OPTIONS, "--method", "none", "--workers", "1")
-    reason = "more than 4 times the ghosts of the neighbouring keys"
+    reason = "ghosts 2 %, more than 4 times the 0 % of the neighbouring keys (median)"
+    assert exit_code("dataset", border_drive, *cheap, "--out", out, "--preview", "8") == 0
+    assert "aside" not in capsys.readouterr().out  # neighbours of a preview may be far away
     for command in (("--data", border_drive, *cheap, "--out", out), ("--status", out)):
         assert exit_code("dataset", *command) == 0
         assert f"{DRIVE} {FRAMES[0]} aside: {reason}" in capsys.readouterr().out
     assert keys_of(maps_in(out)) == {*FRAMES} - {FRAMES[0]}
     assert [sample["frame"] for sample in DepthDataset(out)] == [*FRAMES][1:]
     (page,) = write_report(out)
-    assert page.read_text().count(reason) == 1
+    assert page.read_text().count(reason) == 2  # with its picture, and in the table
+    assert (out / "aside" / DRIVE / f"{FRAMES[0]:010d}.jpg").is_file()
+    assert f"put aside ({reason})" in (out / "densify.log").read_text()

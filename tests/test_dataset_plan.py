@@ -82,7 +82,7 @@ def test_a_set_grows(border_drive: Path, tmp_path: Path, capsys) -> None:
     in_order(out)
     assert {name.split("/")[0] for name in maps_in(out)} == {"val", "train"}
     *_, last = capsys.readouterr().out.split("open first:")
-    assert all(str(out / n) in last for n in ("README.txt", "manifest.jsonl", "dataset.json"))
+    assert all(str(out / n) in last for n in ("report.html", "README.txt", "manifest.jsonl"))
     assert exit_code("dataset", "--status", out) == 0
     assert capsys.readouterr().out.startswith("4 keys: 4 done\n")
     assert read_plan(out)["drives"][DRIVE]["frames"] == [[39, 39], [41, 41]]
@@ -168,7 +168,7 @@ def test_a_key_beyond_a_limit_is_put_aside(border_drive: Path, tmp_path: Path, c
     assert exit_code("dataset", *arguments) == 0
     (record,) = records(out)
     assert record["status"] == "aside" and "sweeps, expected at least 5" in record["reason"]
-    assert record["files"] == {} and maps_in(out) == {}
+    assert [*record["files"]] == [f"aside/{DRIVE}/0000000036.jpg"] and maps_in(out) == {}
     assert f"{DRIVE} 36 aside: {record['reason']}" in capsys.readouterr().out
     before = (out / "manifest.jsonl").read_bytes()
     assert exit_code("dataset", *arguments) == 0

@@ -14,7 +14,7 @@ import pytest
 
 import densify
 from densify.config.errors import InputError
-from densify.dataset.manifest import KeyRecord
+from densify.dataset.manifest import KeyRecord, describe_pace, describe_rest
 from densify.dataset.plan import Recipe, plan, write_plan
 from densify.dataset.report import write_report
 from densify.outputs.kitti_tree import FileRecord
@@ -46,18 +46,21 @@ def page_of(root: Path) -> str:
 def rows_of(page: str, heading: str) -> list[list[str]]:
     """Return the cells of the table below a heading, without its head."""
     table = page.partition(f"<h2>{heading}</h2>")[2].partition("</table>")[0]
-    rows = (re.findall(r"<td>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", table))
-    return [row for row in rows if row]
+    table = re.sub(r"</?(a|b)\b.*?>", "", table)
+    rows = re.findall(r"<tr.*?>(.*?)</tr>", table)
+    return [cells for row in rows if (cells := re.findall(r"<td>(.*?)</td>", row))]
 
 
 def test_keys_with_the_most_ghosts_come_first(described: Path) -> None:
     write_manifest(described, *map(scored, FRAMES))
     page = page_of(described)
-    rows = rows_of(page, "The worst keys")
+    rows = rows_of(page, "All keys, worst first")
     assert "9 done; 2.0 s a key" in page and page.count("<svg") == 3  # ghosts, measured, time
-    assert float(rows[0][2]) == 3 and {row[4] for row in rows} == {"50.0"}
-    assert len(rows) == len(FRAMES)
-    assert page_of(described) == page  # to the last byte, figures too
+    assert float(rows[0][1]) == 3 and {row[2] for row in rows} == {"50.0"}
+    assert "<td><b>3</b></td>" in page  # the score that ranks the key
+    assert len(rows) == len(FRAMES) == page.count("<circle") / 3
+    assert "Worse than usual on KITTI (64 rings): ghosts" in page
+    assert (write_report(described)[0]).read_text() == page  # to the last byte, figures too
 
 
 def test_keys_that_are_not_done_say_why(described: Path) -> None:
@@ -65,24 +68,47 @@ def test_keys_that_are_not_done_say_why(described: Path) -> None:
     torn = KeyRecord(DRIVE, 99, "failed", "torn")
     write_manifest(described, *map(scored, FRAMES[:3]), aside, torn)
     page = page_of(described)
-    reasons = {row[2]: html.unescape(row[3]) for row in rows_of(page, "Failed or put aside")}
-    assert reasons == {"failed": "torn", "aside": "ghost rate <b>"}
-    assert "3 done, 1 put aside, 1 failed, 5 to make" in page
+    rows = {row[0]: html.unescape(row[-1]) for row in rows_of(page, "Failed or put aside")}
+    assert rows == {"key 39": "aside: ghost rate <b>", "key 99": "failed: torn"}
+    assert "3 done, 1 put aside, 1 failed, 5 to make" in page and 'class="hollow"' in page
+    assert "<b>Not finished: 4 of 9 keys</b>; the other 5 keys take about" in page
 
 
-def test_pictures_show_filled_depth_and_confidence_and_lead_to_the_map(described: Path) -> None:
+def test_pictures_show_the_image_filled_depth_and_confidence(described: Path) -> None:
     depth, confidence = np.full((40, 80), 256 * 10, np.uint16), np.full((40, 80), 255, np.uint8)
     files = {}
     for kind, pixels in (("groundtruth_filled", depth), ("confidence", confidence)):
-        name = f"val/{DRIVE}/proj_depth/{kind}/image_02/0000000001.png"
+        name = f"val/{DRIVE}/proj_depth/{kind}/image_02/{FRAMES[0]:010d}.png"
         (described / name).parent.mkdir(parents=True)
         cv2.imwrite(str(described / name), pixels)
         files[name] = FileRecord(1, "")
-    lost = {"val/confidence/lost.png": FileRecord(1, "")}
-    write_manifest(described, replace(scored(1), files=files), replace(scored(2), files=lost))
+    lost = {"val/confidence/image_02/lost.png": FileRecord(1, "")}
+    first = replace(scored(FRAMES[0]), files=files)
+    write_manifest(described, first, replace(scored(FRAMES[1]), files=lost))
     page = page_of(described)
-    assert page.count('src="data:image/jpeg') == 2 and "lost.png: cannot be read" in page
-    assert f'<a href="val/{DRIVE}/proj_depth/confidence' in page
+    alts = re.findall(r'<img alt="(.*?)" src="data:image/jpeg', page)
+    assert alts == [f"{kind}, key 36" for kind in ("image image_02", "filled depth", "confidence")]
+    assert "lost.png: cannot be read" in page
+    (described / "dataset.json").write_text(
+        (described / "dataset.json").read_text().replace('"data": "', '"data": "/moved')
+    )
+    assert page_of(described).count("<img") == 2  # the recording is no longer there
+
+
+def test_the_slowest_key_has_no_part_in_the_time_of_the_others() -> None:
+    records = [replace(scored(key), seconds=s) for key, s in enumerate((100.0, 6.0, 12.0, 6.0))]
+    assert describe_pace(records) == "31.0 s a key (6.0 to 100.0)"
+    assert describe_rest(records, 60) == "the other 60 keys take about 6 to 9 min in one process"
+    assert describe_rest(records[:1], 60) == ""
+
+
+def test_a_key_leads_to_its_own_page_and_many_keys_have_a_histogram(described: Path) -> None:
+    files = {name: FileRecord(1, "") for name in ("000001/figure.png", "000001/report.html")}
+    keys = (replace(scored(key), files=files if key == 1 else {}) for key in range(25))
+    write_manifest(described, *keys)
+    page = page_of(described)
+    assert '<a href="000001/report.html">key 1</a>' in page and "<rect" in page
+    assert set(re.findall(r'<a href="#(row.*?)"', page)) <= set(re.findall(r'id="(row.*?)"', page))
 
 
 def test_the_manifest_is_a_table(described: Path) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Iterable, Sequence
 from importlib import import_module
@@ -374,13 +375,18 @@ _GROUPS = {
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse a command line, None for this process's; return options with the `Verb` as ``verb``."""
+    """Parse a command line, None for this process's.
+
+    The options hold the `Verb` as ``verb`` and the text of the command as ``command``.
+    """
     parser = command_line()
     texts = list(sys.argv[1:] if arguments is None else arguments)
     if "" in texts:  # an empty path would be the current folder
         before = " ".join(texts[: texts.index("")][-1:])
         parser.error(f"got an empty argument after {before!r}; is a shell's variable not set?")
-    return parser.parse_args(texts)
+    options = parser.parse_args(texts)
+    options.command = shlex.join(["densify", *texts])
+    return options
 
 
 def command_line() -> argparse.ArgumentParser:

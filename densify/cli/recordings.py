@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import textwrap
 from collections.abc import Iterator
@@ -27,8 +26,9 @@ from densify.cli.screen import Answer, first_of, log_warnings, percent, progress
 from densify.config import Config, apply_overrides, find_changes, resolve
 from densify.config.errors import ComputationError, InputError
 from densify.dataset.make import Summary, damaged, make_dataset, status
-from densify.dataset.plan import Gate, Recipe, plan
-from densify.dataset.report import write_report
+from densify.dataset.manifest import describe_pace, describe_rest
+from densify.dataset.plan import Gate, Recipe
+from densify.dataset.report import write_set_page
 from densify.doctor import Diagnosis, Verdict, examine
 from densify.flow.two_clouds import estimate_flow
 from densify.geometry.types import Float
@@ -161,42 +161,31 @@ def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
     out = options.out
     if out is None:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
-    recipe, keys, num_keys = _recipe(options), options.keys, 0
-    if options.preview is not None:
-        if options.preview < 1:
-            raise InputError(f"--preview {options.preview}: expected 1 key or more")
-        num_keys = sum(len(drive.keys) for drive in plan(recordings_of(options), keys, recipe))
-        keys = _spread(keys, math.ceil(num_keys / options.preview))
     with progress_on_stderr() as progress:
         summary = make_dataset(
             recordings_of(options),
             out,
-            keys,
-            recipe,
+            options.keys,
+            _recipe(options),
             num_workers=options.workers,
             scheduler=options.scheduler,
             shard=options.shard,
             verify=options.verify,
+            preview=options.preview,
             report=lambda so_far: progress("keys", len(so_far.records), so_far.num_keys),
         )
-    paths = [out / name for name in _FIRST_OF_SET if (out / name).is_file()]
-    text = _describe_set(summary)
-    if options.preview is not None:
-        paths = write_report(out, overwrite=True) + paths
-        if summary.num_made:
-            num_left = num_keys - summary.num_keys
-            left_s = num_left * summary.seconds / summary.num_made  # keys side by side share work
-            text += f"\nthe other {num_left:,} keys take up to {left_s / 60:.0f} min"
-    yield Answer(text, _set_facts(summary), [out], first_of(paths, _FIRST_OF_SET))
+    whole = status(out)
+    to_continue = re.sub(r" --preview[ =]\d+", "", options.command)
+    write_set_page(out, "" if options.preview is None else to_continue)
+    lines = [_describe_set(summary)]
+    if options.preview is not None and whole.num_left:
+        rest = describe_rest(whole.records.values(), whole.num_left)
+        lines.append(f"{rest or f'{whole.num_left:,} keys are left'}: {to_continue}")
     log_warnings((w, r.drive, r.key) for r in summary.records.values() for w in r.warnings)
+    paths = [out / name for name in _FIRST_OF_SET if (out / name).is_file()]
+    yield Answer("\n".join(lines), _set_facts(summary), [out], first_of(paths, _FIRST_OF_SET))
     if summary.count("failed"):
         raise ComputationError(f"{summary.count('failed')} of {summary.num_keys} keys not made")
-
-
-def _spread(keys: slice | None, every: int) -> slice:
-    """Return every n-th of the keys."""
-    keys = keys or slice(None)
-    return slice(keys.start, keys.stop, (keys.step or 1) * every)
 
 
 def _describe_set(summary: Summary) -> str:
@@ -206,8 +195,7 @@ def _describe_set(summary: Summary) -> str:
     counts = [f"{n} {_STATES[state]}" for state, n in numbers.items() if n or state == "done"]
     lines = [f"{summary.num_keys} keys: {', '.join(counts)}"]
     if summary.num_made:
-        pace = summary.seconds / summary.num_made
-        lines[0] += f"; {summary.num_made} now, {pace:.2f} s a key"
+        lines[0] += f"; {summary.num_made} now, {describe_pace(summary.records.values())}"
     means = [(title, facts["means"][score]) for score, title in _SCORES.items()]
     lines.append(", ".join(f"{title} {percent(mean)}" for title, mean in means if mean is not None))
     missing = ["{drive} {key} {status}: {reason}".format(**key) for key in facts["missing"]]

@@ -190,14 +190,15 @@ def progress_on_stderr() -> Iterator[Progress]:
     from tqdm import tqdm
 
     is_hidden = not sys.stderr.isatty()
-    shown_s = time.monotonic()
+    shown_s, shown_stage = time.monotonic(), ""
     with tqdm(total=1, file=sys.stderr, leave=False, bar_format=_BAR, disable=is_hidden) as bar:
 
         def show(stage: str, done: int, total: int) -> None:
-            nonlocal shown_s
+            nonlocal shown_s, shown_stage
             if is_hidden:
-                if time.monotonic() - shown_s >= _LINE_S:
-                    shown_s = time.monotonic()
+                is_end = done == total and stage == shown_stage
+                if is_end or time.monotonic() - shown_s >= _LINE_S:
+                    shown_s, shown_stage = time.monotonic(), "" if is_end else stage
                     print(f"densify: {stage}, {done} of {total}", file=sys.stderr, flush=True)
                 return
             if done < bar.n or total != bar.total:  # another stage

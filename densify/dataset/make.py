@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -32,11 +32,21 @@ from densify.dataset.manifest import (
     finished,
     read_manifests,
 )
-from densify.dataset.plan import Drive, Recipe, plan, planned_keys, read_plan, write_plan
+from densify.dataset.pictures import FILLED, find_map, front_camera, keep_picture
+from densify.dataset.plan import (
+    Drive,
+    Recipe,
+    choose_spread,
+    plan,
+    planned_keys,
+    read_plan,
+    write_plan,
+)
 from densify.flow.engines import check_engine
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Result
 from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
+from densify.outputs.depth_png import read_depth_png
 from densify.outputs.key_outputs import write_result
 from densify.outputs.kitti_tree import FileRecord, write_key, write_readme
 from densify.pipeline import run as pipeline
@@ -90,6 +100,7 @@ def make_dataset(
     scheduler: str | None = None,
     shard: Shard | None = None,
     verify: bool = False,
+    preview: int | None = None,
     report: Callable[[Summary], None] | None = None,
 ) -> Summary:
     """Make a training set from the key sweeps of whole recordings, and return the final progress.
@@ -109,20 +120,25 @@ def make_dataset(
             same files at the same paths. ``tcp://`` trusts everybody on that network.
         shard: (i, n), part i of n, from 1. Machines that share ``out`` may make parts at once.
         verify: Compare finished files with their recorded hashes, and make damaged files again.
+        preview: Make only this number of keys, spread over all. They are not compared with their
+            neighbours before a later call makes the others.
         report: Function called with the progress, before the first and after every key sweep.
     """
     if isinstance(data, str) or not data:
         raise InputError(f"data: got {data!r}, expected a list of recordings, such as ['street']")
     out, recipe = Path(out), recipe or Recipe()
     check_engine(recipe.config.flow.engine)
-    drives = plan(data, keys, recipe)
+    if preview is not None and preview < 1:
+        raise InputError(f"--preview {preview}: expected 1 key or more")
+    planned = plan(data, keys, recipe)
+    drives = planned if preview is None else choose_spread(planned, preview)
     _check_folder(out)
     Cache()  # raises InputError if other users can write to the cache folder
     num_workers = _num_processes(num_workers, recipe, drives)
     age_s, suffix = (0.0, "") if shard is None else (LEFT_AFTER_S, f"-{shard[0]}of{shard[1]}")
     log = out.absolute() / f"densify{suffix}.log"
     with Manifest(out, shard) as manifest:
-        write_plan(out, recipe, drives)  # no log where the plan is refused
+        write_plan(out, recipe, planned)  # no log where the plan is refused
         with logged_to(log):
             clear_leftovers(out, age_s)
             if recipe.layout == "kitti-depth":
@@ -133,9 +149,10 @@ def make_dataset(
             _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
             outcomes = call_all(make_key, groups, num_workers, log, scheduler)
             summary = _record(outcomes, manifest, records, num_keys, report)
-            if recipe.gate.max_ratio is not None:
+            if recipe.gate.max_ratio is not None and preview is None:
                 worse = worse_than_neighbours(records, recipe.gate.max_ratio)
-                records |= {record.name: record for record in manifest.set_aside(worse)}
+                keep = partial(_keep_picture, out, {drive.name: drive for drive in drives})
+                records |= {record.name: record for record in manifest.set_aside(worse, keep)}
             clear_leftovers(out, age_s)  # hidden folders of killed workers
     return summary
 
@@ -261,6 +278,19 @@ def _record(
     return summary
 
 
+def _keep_picture(
+    out: Path, drives: Mapping[str, Drive], record: KeyRecord
+) -> dict[str, FileRecord]:
+    """Write the picture of a finished key that is put aside; return its path and record."""
+    drive = drives[record.drive]
+    name = find_map(record, FILLED, front_camera(drive))
+    try:
+        filled_m = None if name is None else read_depth_png(out / name)
+    except InputError:  # a damaged map, which is deleted anyway
+        filled_m = None
+    return {} if filled_m is None else keep_picture(out, drive, record.key, filled_m)
+
+
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
     """Return finished key -> reason, for keys with far more ghosts or outliers than neighbours.
 
@@ -279,25 +309,29 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
         num_beside = 2 * max(len(record.frames) for record in drive)
         for score, title in _JUDGED.items():
             shares = [max(record.values_of(score), default=np.nan) for record in drive]
-            for row in _outlying(shares, num_beside, max_ratio):
+            for row, median in _outlying(shares, num_beside, max_ratio):
                 if drive[row].status == "done":
-                    worse[drive[row].name].append(title)
-    return {
-        name: f"more than {max_ratio:g} times the {' and '.join(titles)} of the neighbouring keys"
-        for name, titles in sorted(worse.items())
-    }
+                    worse[drive[row].name].append(
+                        f"{title} {100 * shares[row]:.2g} %, more than {max_ratio:g} times the "
+                        f"{100 * median:.2g} % of the neighbouring keys (median)"
+                    )
+    return {name: "; ".join(reasons) for name, reasons in sorted(worse.items())}
 
 
-def _outlying(shares: Sequence[float], num_beside: int, max_ratio: float) -> Iterator[int]:
-    """Yield the rows whose share exceeds the median of ``num_beside`` neighbours by the ratio."""
+def _outlying(
+    shares: Sequence[float], num_beside: int, max_ratio: float
+) -> Iterator[tuple[int, float]]:
+    """Yield (row, median of ``num_beside`` neighbours) where the share exceeds the ratio."""
     for row, share in enumerate(shares):
         # At the ends, all neighbours are on one side.
         begin = max(0, min(row - num_beside // 2, len(shares) - num_beside - 1))
         beside = np.array([*shares[begin:row], *shares[row + 1 : begin + num_beside + 1]])
         beside = beside[np.isfinite(beside)]
         # With a single neighbour it is unknown which of the two keys is unusual.
-        if len(beside) > 1 and share > max(_LEAST_SHARE, max_ratio * float(np.median(beside))):
-            yield row
+        if len(beside) > 1:
+            median = float(np.median(beside))
+            if share > max(_LEAST_SHARE, max_ratio * median):
+                yield row, median
 
 
 # Any process
@@ -354,16 +388,26 @@ def _densified(job: Job, key: int) -> KeyRecord:
     result = results[recipe.method]
     scores = _scores(result.metrics)
     reason = recipe.gate.reason(scores, len(result.frames))
+    files = _write(job, results) if reason is None else _keep_result(job, result)
     return KeyRecord(
         job.drive.name,
         key,
         "done" if reason is None else "aside",
         reason,
         frames=result.frames,
-        files=_write(job, results) if reason is None else {},
+        files=files,
         scores=scores,
         warnings=result.warnings,
     )
+
+
+def _keep_result(job: Job, result: Result) -> dict[str, FileRecord]:
+    """Write the picture of a key that is beyond a limit; return its path and record."""
+    camera = front_camera(job.drive)
+    names = [name for name in result.depth if name.partition("/")[0] == camera]
+    if not names:
+        return {}
+    return keep_picture(job.out, job.drive, result.key, result.depth[names[0]].filled_m)
 
 
 def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ The file is ``OUT/manifest.jsonl``, or ``OUT/manifest-2of4.jsonl`` for the secon
     status, reason   done, aside (made, but beyond a limit of the scores and not kept) or
                      failed; the reason is null for done
     frames           frame numbers of the sweeps in the window
-    files            path relative to OUT, with slashes -> bytes, sha256
+    files            path relative to OUT, with slashes -> bytes, sha256; a picture for aside
     scores           numbers; null if unknown
     seconds          computing time
     warnings         sentences about assumptions and suspicions
@@ -21,11 +21,13 @@ import fcntl
 import json
 import logging
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import import_extra, parse_json, read_bytes
@@ -118,6 +120,27 @@ def manifest(folder: str | Path) -> Any:
     return pandas.DataFrame(rows)
 
 
+def describe_pace(records: Iterable[KeyRecord]) -> str:
+    """Return the computing time of a key as text: the mean over all that were tried, the range."""
+    seconds = [record.seconds for record in records]
+    if not seconds:
+        return ""
+    span = f" ({min(seconds):.1f} to {max(seconds):.1f})" if len(seconds) > 1 else ""
+    return f"{np.mean(seconds):.1f} s a key{span}"
+
+
+def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:
+    """Return the time that further keys take as text, "" if it cannot be told."""
+    seconds = sorted(record.seconds for record in records)
+    if len(seconds) < 2 or not num_left:
+        return ""
+    others = seconds[:-1]  # the slowest key waited for compilation
+    low_s, high_s = np.quantile(others, 0.25), max(np.quantile(others, 0.75), np.mean(others))
+    low, high = (f"{num_left * value / 60:.0f}" for value in (low_s, high_s))
+    span = high if low == high else f"{low} to {high}"
+    return f"the other {num_left:,} keys take about {span} min in one process"
+
+
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:
     """Return the records of all manifests in a folder, ordered by drive and frame number.
 
@@ -199,21 +222,28 @@ class Manifest:
             file.flush()
             os.fsync(file.fileno())
 
-    def set_aside(self, reasons: Mapping[Key, str]) -> list[KeyRecord]:
+    def set_aside(
+        self,
+        reasons: Mapping[Key, str],
+        keep_picture: Callable[[KeyRecord], Mapping[str, FileRecord]],
+    ) -> list[KeyRecord]:
         """Delete the files of these finished keys, record the reasons, return the new records.
 
-        Keys that are not done in this manifest are left out.
+        ``keep_picture`` returns the files that take their place. Keys that are not done in this
+        manifest are left out.
         """
         aside = []
         for name, (record, _) in _read(self.path).items():
             if name not in reasons or record.status != "done":
                 continue
+            kept = keep_picture(record)
             with self._errors_explained():
                 # Files first: if the process is killed here, the key sweep is made again.
                 for file in record.files:
                     (self.path.parent / file).unlink(missing_ok=True)
-            aside.append(replace(record, status="aside", reason=reasons[name], files={}))
+            aside.append(replace(record, status="aside", reason=reasons[name], files=kept))
             self.append(aside[-1])
+            _log.debug("key %d of %s: put aside (%s)", record.key, record.drive, reasons[name])
         return aside
 
     def _put_in_order(self) -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
@@ -160,6 +160,21 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
         blocks = tuple(tuple(block) for _, block in groupby(wanted, cut.number_of.__getitem__))
         drives[name] = Drive(name, Spec.parse(spec).absolute(), folder, cameras, blocks)
     return list(drives.values())
+
+
+def choose_spread(drives: Sequence[Drive], num_keys: int) -> list[Drive]:
+    """Return the recordings with ``num_keys`` of their keys alone, spread evenly over all keys.
+
+    The first is half a step after the start, because windows are cut at the ends.
+    """
+    names = [(drive.name, key) for drive in drives for key in drive.keys]
+    rows = (np.arange(num_keys) + 0.5) * len(names) / num_keys
+    chosen = {names[int(row)] for row in rows}
+    thinned = []
+    for drive in drives:
+        blocks = (tuple(k for k in keys if (drive.name, k) in chosen) for keys in drive.blocks)
+        thinned.append(replace(drive, blocks=tuple(filter(None, blocks))))
+    return thinned
 
 
 def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import html
 import io
 import re
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,8 +36,12 @@ _MIN_WIDTH_PX = 480
 _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX, _BAR_PX, _MARGIN_PX = 36, 60, 15, 12
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
-_AXES_INCH, _SCORE_INCH = (8.6, 4.8), (5.2, 2.2)
-_BLUE = "#4662d7"
+_AXES_INCH = (8.6, 4.8)
+# An SVG of a score: a histogram at the left, dots at the right, frame numbers below.
+_PLOT_PX, _PLOT_TOP_PX, _PLOT_BASE_PX = (400, 160), 26, 138
+_LABELS_PX, _HISTOGRAM_PX, _GAP_PX = 40, 60, 6
+_FEWEST_IN_HISTOGRAM, _NUM_BINS, _LEAST_LABEL_PX = 20, 20, 70
+_AXIS_ENDS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # times a power of ten
 _FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
 _MIN_TRAVEL_M = 1.0
 """A shorter way may be noise of the registration, of a vehicle at rest."""
@@ -107,19 +113,25 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
     from red at 3 m to blue at 80 m on a logarithmic scale.
     """
     kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
-    gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
     enlarge = max(1.0, _MIN_WIDTH_PX / image.shape[1])
     rows = []
     for title, depth_m in panels.items():
         nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
         nearest_m = cv2.erode(nearest_m, kernel).astype(np.float32, copy=False)
-        picture = cv2.merge([gray, gray, gray])
-        picture[nearest_m < _NO_DEPTH_M] = colour_depth(nearest_m)[nearest_m < _NO_DEPTH_M]
-        picture = cv2.resize(picture, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_NEAREST)
+        drawn = depth_over_image(image, np.where(nearest_m < _NO_DEPTH_M, nearest_m, 0))
+        picture = cv2.resize(drawn, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_NEAREST)
         strip = np.full((_TITLE_PX, picture.shape[1], 3), 255, np.uint8)
         _write(strip, title, _MARGIN_PX, picture.shape[1] - _MARGIN_PX)
         rows += [strip, picture]
     return np.concatenate([*rows, _scale(rows[0].shape[1])])
+
+
+def depth_over_image(image: Picture, depth_m: Float32) -> Picture:
+    """Return the (H,W,3) colours, as blue, green, red, of depth over an RGB image in dark gray."""
+    gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
+    picture = cv2.merge([gray, gray, gray]).astype(np.uint8, copy=False)
+    picture[depth_m > 0] = colour_depth(depth_m)[depth_m > 0]
+    return picture
 
 
 def colour_depth(depth_m: Float32) -> Picture:
@@ -158,24 +170,69 @@ def _write(strip: Picture, text: str, left_px: int, right_px: int, centred: bool
     cv2.putText(strip, text, at, _FONT, shrink * _FONT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-def score_figure(title: str, unit: str, values: Float) -> str:
-    """Return the histogram and the timeline of a score of N keys as SVG; NaN is no value."""
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
+class Dot(NamedTuple):
+    """A key in the plot of a score."""
 
-    figure = Figure(figsize=_SCORE_INCH, layout="constrained")
-    histogram, timeline = figure.subplots(1, 2, sharey=True, width_ratios=(1, 3))
-    histogram.hist(values[np.isfinite(values)], bins=20, orientation="horizontal", color=_BLUE)
-    histogram.set(ylabel=unit, xlabel="keys")
-    timeline.plot(values, ".", color=_BLUE, markersize=4)
-    timeline.set(title=title, xlabel="keys in order of recording and time")
-    for axes in (histogram, timeline):
-        axes.xaxis.get_major_locator().set_params(integer=True)
-    file = io.StringIO()
-    with rc_context({"svg.hashsalt": title}):  # equal figures have equal bytes
-        figure.savefig(file, format="svg", metadata={"Date": None})
-    svg = file.getvalue()
-    return svg[svg.index("<svg") :]
+    recording: str
+    frame: int
+    value: float
+    is_kept: bool  # False draws a hollow dot
+    target: str  # identifier of the element of the page that the dot leads to
+
+
+def score_plot(title: str, unit: str, dots: Sequence[Dot]) -> str:
+    """Return SVG with a score over the frame numbers of each recording, from 20 keys a histogram.
+
+    ``dots`` are ordered by recording and frame.
+    """
+    largest = max((dot.value for dot in dots), default=0.0) or 1.0
+    power = 10.0 ** np.floor(np.log10(largest))
+    end = next(power * factor for factor in _AXIS_ENDS if power * factor >= 0.999 * largest)
+    scale_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / end  # per unit of the score
+    (width_px, height_px), left_px = _PLOT_PX, _LABELS_PX
+    parts = [f'<text x="{left_px}" y="14" class="title">{html.escape(title)}, {unit}</text>']
+    for tick in (0.0, end / 2, end):
+        y = _PLOT_BASE_PX - tick * scale_px
+        parts.append(f'<path d="M{left_px} {y:.1f}H{width_px}"/>')
+        parts.append(f'<text x="{left_px - 4}" y="{y + 4:.1f}" class="end">{tick:g}</text>')
+    if len(dots) >= _FEWEST_IN_HISTOGRAM:
+        counts = np.histogram([dot.value for dot in dots], _NUM_BINS, (0, end))[0]
+        bar_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / _NUM_BINS
+        parts += [
+            f'<rect x="{left_px}" y="{_PLOT_BASE_PX - (row + 1) * bar_px:.1f}" height="'
+            f'{bar_px - 1:.1f}" width="{_HISTOGRAM_PX * num / counts.max():.1f}"/>'
+            for row, num in enumerate(counts)
+        ]
+        left_px += _HISTOGRAM_PX
+    parts += _draw_dots(dots, left_px + _GAP_PX, unit, scale_px)
+    label = html.escape(f"{title} of each key over its frame number")
+    size = f"0 0 {width_px} {height_px}"
+    return f'<svg viewBox="{size}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+
+
+def _draw_dots(dots: Sequence[Dot], left_px: float, unit: str, scale_px: float) -> list[str]:
+    """Return the dots of all recordings side by side, with the first and last frame of each."""
+    groups = [list(group) for _, group in groupby(dots, key=lambda dot: dot.recording)]
+    spans = [max(1, group[-1].frame - group[0].frame) for group in groups]
+    room_px = _PLOT_PX[0] - left_px - _GAP_PX * (2 * len(groups) - 1)
+    frame_px = max(room_px, 1) / max(sum(spans), 1)
+    parts = []
+    for group, span in zip(groups, spans, strict=True):
+        first, last = group[0].frame, group[-1].frame
+        for dot in group:
+            x, y = left_px + (dot.frame - first) * frame_px, _PLOT_BASE_PX - dot.value * scale_px
+            hollow = "" if dot.is_kept else ' class="hollow"'
+            text = html.escape(f"{dot.recording}, key {dot.frame}: {dot.value:.3g} {unit}")
+            parts.append(
+                f'<a href="#{html.escape(dot.target)}"><circle cx="{x:.1f}" cy="{y:.1f}" r="3"'
+                f"{hollow}><title>{text}</title></circle></a>"
+            )
+        end_px = left_px + span * frame_px
+        if span * frame_px >= _LEAST_LABEL_PX:
+            parts.append(f'<text x="{left_px:.1f}" y="154">frame {first}</text>')
+            parts.append(f'<text x="{end_px:.1f}" y="154" class="end">{last}</text>')
+        left_px = end_px + 2 * _GAP_PX
+    return parts
 
 
 def write_curve(result: Result, folder: Path) -> None:
