@@ -161,12 +161,13 @@ def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
     out = options.out
     if out is None:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
+    recipe = _recipe(options)
     with progress_on_stderr() as progress:
         summary = make_dataset(
             recordings_of(options),
             out,
             options.keys,
-            _recipe(options),
+            recipe,
             num_workers=options.workers,
             scheduler=options.scheduler,
             shard=options.shard,
