@@ -39,10 +39,10 @@ def drive_of(shares: list[float | None], **scores) -> dict:
     ("shares", "worse"),
     [
         (USUAL, []),
-        ([0.006, 0.004, *USUAL, 0.003], [0, 1, 32]),  # the ends stand out
+        ([0.016, 0.012, *USUAL, 0.009], [0, 1, 32]),  # the ends stand out
         ([0.01] * 20, []),  # worse than other drives, everywhere
         ([0.001 * 1.15**key for key in range(30)], []),  # or slowly becoming so
-        ([0.0009, *[0.0] * 20], []),  # next to no ghosts
+        ([0.007, *[0.0] * 20], []),  # no more ghosts than usual
         ([None] * 9, []),
         ([0.5, 0.0], []),  # which of two is unusual?
         ([], []),

@@ -58,8 +58,9 @@ from densify.version import __version__
 _log = logging.getLogger("densify")
 _KEYS_PER_PROCESS = 8  # fewer are done before another process has started
 _BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # memory per process, and per sweep of 64 rings
-_LEAST_SHARE = 0.001  # smaller shares of ghosts or outliers do not matter to a training set
-_JUDGED = {"ghost": "ghosts", "outliers": "held-out outliers"}
+# Name of a score in a manifest line -> title, and the share that 95 % of 20 keys of a KITTI drive
+# stay below: smaller shares are usual
+_JUDGED = {"ghost": ("ghosts", 0.0075), "outliers": ("held-out outliers", 0.009)}
 Shard = tuple[int, int]
 """(i, n), part i of n, from 1."""
 
@@ -294,8 +295,8 @@ def _keep_picture(
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
     """Return finished key -> reason, for keys with far more ghosts or outliers than neighbours.
 
-    Such a share exceeds 0.1 % and ``max_ratio`` times the median of the neighbours in the
-    recording. Unlike a limit for all recordings, this detects keys that are bad for their own
+    Such a share exceeds what is usual on KITTI (0.75 % ghosts, 0.9 % held-out outliers), and
+    ``max_ratio`` times the median of the neighbours in the recording. Unlike a limit for all recordings, this detects keys that are bad for their own
     recording, such as keys with cut windows at its ends.
     """
     drives: dict[str, list[KeyRecord]] = defaultdict(list)
@@ -307,9 +308,9 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
         drive.sort(key=lambda record: record.key)
         # Twice a window: the keys whose windows an end cuts are the minority of neighbours.
         num_beside = 2 * max(len(record.frames) for record in drive)
-        for score, title in _JUDGED.items():
+        for score, (title, usual_share) in _JUDGED.items():
             shares = [max(record.values_of(score), default=np.nan) for record in drive]
-            for row, median in _outlying(shares, num_beside, max_ratio):
+            for row, median in _outlying(shares, num_beside, usual_share, max_ratio):
                 if drive[row].status == "done":
                     worse[drive[row].name].append(
                         f"{title} {100 * shares[row]:.2g} %, more than {max_ratio:g} times the "
@@ -319,9 +320,9 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
 
 
 def _outlying(
-    shares: Sequence[float], num_beside: int, max_ratio: float
+    shares: Sequence[float], num_beside: int, usual_share: float, max_ratio: float
 ) -> Iterator[tuple[int, float]]:
-    """Yield (row, median of ``num_beside`` neighbours) where the share exceeds the ratio."""
+    """Yield (row, median of ``num_beside`` neighbours) of shares that are worse than usual."""
     for row, share in enumerate(shares):
         # At the ends, all neighbours are on one side.
         begin = max(0, min(row - num_beside // 2, len(shares) - num_beside - 1))
@@ -330,7 +331,7 @@ def _outlying(
         # With a single neighbour it is unknown which of the two keys is unusual.
         if len(beside) > 1:
             median = float(np.median(beside))
-            if share > max(_LEAST_SHARE, max_ratio * median):
+            if share > max(usual_share, max_ratio * median):
                 yield row, median
 
 

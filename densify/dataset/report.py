@@ -189,9 +189,10 @@ def _verdict(made: _Set) -> str:
     num_out = len(made.records) - len(made.worst_first)
     if not made.worst_first:
         return "No key is done."
-    lines = ["As good as usual on KITTI (64 rings), in every score."]
+    compared = [score.title.lower() for score in _SCORES if score.usual and made.values(score)]
+    lines = [f"As usual on KITTI's drive 0013 (64 rings, window 5): {', '.join(compared)}."]
     if worse:
-        lines = [f"Worse than usual on KITTI (64 rings): {', '.join(worse)}. See the worst keys."]
+        lines = [f"Worse than usual on KITTI's drive 0013: {', '.join(worse)}. See the worst keys."]
     if num_out > _MANY_ASIDE * len(made.records):
         lines.append(f"{num_out:,} of {len(made.records):,} keys were put aside or failed.")
     return " ".join(lines)
