@@ -59,7 +59,7 @@ def test_keys_with_the_most_ghosts_come_first(described: Path) -> None:
     assert float(rows[0][1]) == 3 and {row[2] for row in rows} == {"50.0"}
     assert "<td><b>3</b></td>" in page  # the score that ranks the key
     assert len(rows) == len(FRAMES) == page.count("<circle") / 3
-    assert "Worse than usual on KITTI's drive 0013: ghosts" in page
+    assert "Worse than usual on KITTI drive 0013: ghosts" in page
     assert (write_report(described)[0]).read_text() == page  # to the last byte, figures too
 
 

@@ -296,8 +296,9 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
     """Return finished key -> reason, for keys with far more ghosts or outliers than neighbours.
 
     Such a share exceeds what is usual on KITTI (0.75 % ghosts, 0.9 % held-out outliers), and
-    ``max_ratio`` times the median of the neighbours in the recording. Unlike a limit for all recordings, this detects keys that are bad for their own
-    recording, such as keys with cut windows at its ends.
+    ``max_ratio`` times the median of the neighbours in the recording. Unlike a limit for all
+    recordings, this detects keys that are bad for their own recording, such as keys with cut
+    windows at its ends.
     """
     drives: dict[str, list[KeyRecord]] = defaultdict(list)
     for record in records.values():

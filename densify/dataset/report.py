@@ -190,9 +190,9 @@ def _verdict(made: _Set) -> str:
     if not made.worst_first:
         return "No key is done."
     compared = [score.title.lower() for score in _SCORES if score.usual and made.values(score)]
-    lines = [f"As usual on KITTI's drive 0013 (64 rings, window 5): {', '.join(compared)}."]
+    lines = [f"As usual on KITTI drive 0013 (64 rings, window 5): {', '.join(compared)}."]
     if worse:
-        lines = [f"Worse than usual on KITTI's drive 0013: {', '.join(worse)}. See the worst keys."]
+        lines = [f"Worse than usual on KITTI drive 0013: {', '.join(worse)}. See the worst keys."]
     if num_out > _MANY_ASIDE * len(made.records):
         lines.append(f"{num_out:,} of {len(made.records):,} keys were put aside or failed.")
     return " ".join(lines)

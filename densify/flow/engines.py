@@ -32,7 +32,7 @@ class Scene:
 
     @cached_property
     def candidates(self) -> tuple[Candidates, ...]:
-        """For each sweep, its points above the ground and which of them may move."""
+        """The points of each sweep above the ground, and which of them may move."""
         return find_candidates(self.stretch, self.space, self.ground)
 
     def is_asked(self, i: int) -> bool:
