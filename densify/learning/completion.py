@@ -27,19 +27,22 @@ _FOCAL_PX = 400.0
 _CROP_PX = (112, 176)  # height, width
 _BATCH = 4
 _WIDTHS = (24, 32, 48, 64, 64)  # channels of the levels of the U-Net
-_LEARNING_RATE = 6e-3
+_LEARNING_RATE = 2e-3
+_LARGEST_GRADIENT = 1.0
 _NUM_COMPARED = 4096  # pixels of a crop on which the loss is taken
 _MOST_TARGETS = 60_000  # pixels of an image that are kept to train on
 _INPUT_SHARE = 0.8  # of the returns, if the others are held out to train on
 _USUAL_LOG_M = 2.7  # where there is no return at all
 _NONE = 99.0  # log depth of a pixel without a return
 _NEIGHBOURHOODS_PX = (7, 15)
+_SMOOTHING_PX = (40.0, 16.0, 7.0, 3.5, 2.0, 1.0)  # standard deviations, the finest last
+_LEAST_DENSITY = 0.003  # of returns, weighted by a Gaussian, at which it is used
 
 
 class Sample(NamedTuple):
     """An image with a sparse depth, and depths to train on, reduced to the common focal length."""
 
-    image: Float32  # (3,h,w) RGB, 0 to 1
+    image: Float32  # (3,h,w) RGB with mean 0 and deviation 1
     returns: Float32  # (R,3) column, row in px of the reduced image, 0 at its corner; depth in m
     # (T,4) as ``returns``, and weight; None to hold out returns at random
     target: Float32 | None
@@ -73,6 +76,7 @@ class Sample(NamedTuple):
             weights = np.ones(shape, np.float32) if weight is None else weight
             target = _listed(target_m, weights, width, height)
         returns = _listed(sparse_m, sparse_m, width, height)[:, :3]
+        small = (small - small.mean((0, 1))) / (small.std() + np.float32(1e-3))
         return Sample(np.ascontiguousarray(small.transpose(2, 0, 1)), returns, target, shape)
 
 
@@ -88,10 +92,10 @@ def _listed(depth_m: Float32, weight: Float32, width: int, height: int) -> Float
 
 
 class Completion(nn.Module):
-    """A U-Net that weighs five depths of each pixel, and adds a change of its own.
+    """A U-Net that weighs six depths of each pixel, and adds a change of its own.
 
-    The five are interpolated returns, and the nearest and farthest return of two neighbourhoods.
-    Untrained, it interpolates.
+    The six are two weighted means of the returns around, and the nearest and the farthest return in
+    two squares. An untrained network interpolates.
     """
 
     def __init__(self, with_returns: bool = True) -> None:
@@ -99,7 +103,7 @@ class Completion(nn.Module):
         super().__init__()
         self.with_returns = with_returns
         levels = list(pairwise(_WIDTHS))
-        num_choices = 1 + 2 * len(_NEIGHBOURHOODS_PX)
+        num_choices = 2 + 2 * len(_NEIGHBOURHOODS_PX)
         self._first = _convolution(3 + num_choices + 1, _WIDTHS[0], 2)
         self._down = nn.ModuleList(_convolution(a, b, 2) for a, b in levels)
         self._up = nn.ModuleList(_convolution(b + a, a) for a, b in levels)
@@ -109,11 +113,9 @@ class Completion(nn.Module):
             self._last.bias.copy_(torch.tensor([4.0] + num_choices * [0.0]))  # type: ignore[union-attr]
 
     def forward(self, image: Tensor, log_depths: Tensor) -> Tensor:
-        """Return the log depth (N,1,h,w) for images (N,3,h,w) and `_log_depths` (N,6,h,w)."""
-        colours = image - image.mean((2, 3), keepdim=True)
-        colours = colours / (image.std((1, 2, 3), keepdim=True) + 1e-3)
+        """Return the log depth (N,1,h,w) for images (N,3,h,w) and `_log_depths` (N,7,h,w)."""
         choices, base = log_depths[:, :-1], log_depths[:, :1]
-        inputs = [colours, base - _USUAL_LOG_M, choices[:, 1:] - base, log_depths[:, -1:]]
+        inputs = [image, base - _USUAL_LOG_M, choices[:, 1:] - base, log_depths[:, -1:]]
         x = self._first(torch.cat(inputs, 1).contiguous(memory_format=torch.channels_last))
         skips = []
         for down in self._down:
@@ -133,35 +135,27 @@ def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
 
 
 def _log_depths(returns: Float32, shape: tuple[int, ...], with_returns: bool) -> Float32:
-    """Return (6,h,w): interpolated log depth, nearest and farthest of two sizes, has a return."""
+    """Return (7,h,w): `Completion`'s six log depths, and 1 where there is a return."""
     if not with_returns:
         returns = np.zeros((0, 3), np.float32)
     nearest = np.full(shape, _NONE, np.float32)
     column, row = returns[:, :2].astype(int).T
     np.minimum.at(nearest, (row, column), np.log(returns[:, 2]))
     has_return = (nearest < _NONE).astype(np.float32)
-    base = _interpolated(np.where(has_return > 0, nearest, np.float32(0)), has_return)
-    layers = [base]
+    inverse = has_return * np.exp(-nearest)  # linear over a plane, unlike depth
+    smooth, layers = np.full(shape, np.exp(-_USUAL_LOG_M), np.float32), []
+    for sigma_px in _SMOOTHING_PX:
+        weight = cv2.GaussianBlur(has_return, (0, 0), sigma_px)
+        mean = cv2.GaussianBlur(inverse, (0, 0), sigma_px) / np.maximum(weight, 1e-9)
+        smooth = np.where(weight > _LEAST_DENSITY, mean, smooth)
+        layers.append(-np.log(smooth))
+    layers = layers[: -3 : -1]
     for size in _NEIGHBOURHOODS_PX:
         square = np.ones((size, size), np.uint8)
         low = cv2.erode(nearest, square)
         high = -cv2.erode(np.where(has_return > 0, -nearest, np.float32(_NONE)), square)
-        layers += [np.where(low < _NONE, low, base), np.where(high > -_NONE, high, base)]
-    return np.stack([*layers, has_return])
-
-
-def _interpolated(value: Float32, weight: Float32) -> Float32:
-    """Fill holes (weight 0) of (h,w) values by the finest level of a pyramid that has values."""
-    if max(value.shape) == 1:
-        return np.where(weight > 0, value / np.maximum(weight, 1e-9), np.float32(_USUAL_LOG_M))
-    rows, columns = ((size + 1) // 2 for size in value.shape)
-    halved = []
-    for image in (value, weight):
-        padded = np.zeros((2 * rows, 2 * columns), np.float32)
-        padded[: image.shape[0], : image.shape[1]] = image
-        halved.append(padded.reshape(rows, 2, columns, 2).mean((1, 3)))
-    coarser = cv2.resize(_interpolated(*halved), value.shape[::-1])
-    return np.where(weight > 0, value / np.maximum(weight, 1e-9), coarser).astype(np.float32)
+        layers += [np.where(low < _NONE, low, layers[0]), np.where(high > -_NONE, high, layers[0])]
+    return np.stack([*layers, has_return]).astype(np.float32)
 
 
 def train(
@@ -210,6 +204,7 @@ def train(
             loss = (weight * error).sum() / weight.sum().clamp(min=1e-9)
             optimiser.zero_grad()
             loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
             optimiser.step()
             schedule.step()
             if progress is not None:
@@ -220,7 +215,7 @@ def train(
 def _crop(
     sample: Sample, size: tuple[int, int], with_returns: bool, rng: np.random.Generator
 ) -> tuple[Float32, Float32, Float32, Float32]:
-    """Return image (3,h,w), `_log_depths` (6,h,w), positions (N,2) from -1 to 1, targets (N,2)."""
+    """Return image (3,h,w), `_log_depths` (7,h,w), positions (N,2) from -1 to 1, targets (N,2)."""
     returns, target = sample.returns, sample.target
     if target is None:
         is_input = rng.random(len(returns)) < _INPUT_SHARE
