@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import numpy as np
 
 import densify
+from densify.learning.completion import Completion, Sample, predict, train
 from densify.scores.depth_metrics import depth_errors
-from densify.learning.completion import Sample, predict, train
 
 
 def samples(folder: str) -> Iterator[tuple[Sample, np.ndarray, float]]:
@@ -26,14 +26,20 @@ def samples(folder: str) -> Iterator[tuple[Sample, np.ndarray, float]]:
         yield Sample.of(image, sparse_m, dense_m, confidence, focal_px=focal_px), dense_m, focal_px
 
 
+def outliers(network: Completion, folder: str) -> float:
+    """Return the mean share of outliers against the dense depth of a set."""
+    errors = (
+        depth_errors(predict(network, sample), dense_m, focal_px=focal_px)
+        for sample, dense_m, focal_px in samples(folder)
+    )
+    return float(np.mean([of_image.outliers for of_image in errors]))
+
+
 def main() -> None:
     folder, test, *steps = sys.argv[1:]
+    print(f"untrained {outliers(Completion().eval(), test):.2%} outliers against {test}")
     network = train([sample for sample, *_ in samples(folder)], int(*steps or [250]))
-    outliers = [
-        depth_errors(predict(network, sample), dense_m, focal_px=focal_px).outliers
-        for sample, dense_m, focal_px in samples(test)
-    ]
-    print(f"{np.mean(outliers):.2%} outliers against the maps of {test}")
+    print(f"trained   {outliers(network, test):.2%}")
 
 
 if __name__ == "__main__":

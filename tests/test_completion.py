@@ -139,7 +139,7 @@ def test_an_interrupted_benchmark_continues_to_the_same_bytes(small, tmp_path: P
     of_seeds = table["streets"]["rigid (ICP)"]
     assert len(of_seeds) == 2 and of_seeds[0] != of_seeds[1]
     assert 0 < of_seeds[0]["street, exact"]["moving"]["outliers"] < 1
-    with pytest.raises(InputError, match="2 steps"):
+    with pytest.raises(InputError, match="with steps 2, asked for 3"):
         bench_training(None, folder, plan._replace(steps=3))
     with pytest.raises(InputError, match="got 'rigid'"):
         bench_training(None, folder, plan._replace(targets=("rigid",)))

@@ -72,15 +72,17 @@ class TruthMap(NamedTuple):
 
 
 class Altered:
-    """A recording with altered sweeps or other recorded poses; all else is as recorded."""
+    """A recording with altered or fewer sweeps or other recorded poses; all else is as recorded."""
 
     def __init__(
         self,
         sequence: Any,
         sweep: Callable[[Sweep], Sweep] | None = None,
         T_world_lidar: Callable[[int], Float] | None = None,
+        frames: Sequence[int] | None = None,
     ) -> None:
         self._sequence, self._alter = sequence, sweep
+        self.frames = sequence.frames if frames is None else frames
         if T_world_lidar is not None:
             self.T_world_lidar = T_world_lidar
 

@@ -13,19 +13,20 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from densify.bench.baselines import ip_basic
-from densify.bench.depth import TruthMap, without_scanner
+from densify.bench.depth import Altered, TruthMap, without_scanner
 from densify.bench.gate import KEYS, GateKey, Subject
 from densify.config import resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.depth.exposure import key_shots, load_images
-from densify.geometry.types import Progress
+from densify.geometry.types import LidarSequence, Progress
 from densify.learning.completion import Completion, Sample, predict, train
 from densify.outputs.atomic import file_aside, write_json
 from densify.pipeline.recording import Recording
@@ -47,6 +48,11 @@ class Part(NamedTuple):
     cameras: tuple[str, ...] = ("image_02",)
     scanner: int | None = None  # index of the scanner whose returns are kept for the tests
 
+    @property
+    def is_real(self) -> bool:
+        """True for a real recording, False for a street."""
+        return not self.data.startswith("street")
+
 
 _KITTI = Part("kitti/2011_09_26/2011_09_26_drive_0013_sync", range(100, 132))
 _PANDASET = Part("pandaset/002", range(10, 21), ("front_camera", "left_camera"), scanner=1)
@@ -58,9 +64,9 @@ _STREETS = (
 
 SETS: Mapping[str, tuple[Part, ...]] = {
     "both": (_KITTI, _PANDASET),
+    "streets": _STREETS,
     "KITTI": (_KITTI,),
     "PandaSet": (_PANDASET,),
-    "streets": _STREETS,
 }
 """Name of a training set -> its key sweeps."""
 
@@ -122,12 +128,12 @@ def bench_training(
     for names, known in ((plan.sets, SETS), (plan.targets, TARGETS)):
         if unknown := [name for name in names if name not in known]:
             raise InputError(f"got {unknown[0]!r}, expected some of {'; '.join(known)}")
-    path = out / ("training.json" if plan.with_returns else "training-image-alone.json")
-    stored = _read(path, plan.steps)
-    rows: dict[str, Any] = stored["rows"]
-    sets = [name for name in plan.sets if folder or not _is_real(SETS[name][0].data)]
+    sets = [name for name in plan.sets if folder or not SETS[name][0].is_real]
     maps = {name: _map_files(SETS[name], folder, out, progress) for name in sets}
     tests = _tests(folder, out, progress)
+    path = out / ("training.json" if plan.with_returns else "training-image-alone.json")
+    stored = _read(path, {"steps": plan.steps, "tests": [*tests]})
+    rows: dict[str, Any] = stored["rows"]
     wanted = {
         f"{name} | {target} | {seed}": (name, target, seed)
         for name in sets
@@ -155,16 +161,17 @@ def mean_and_error(values: Sequence[float]) -> tuple[float | None, float | None]
     return float(np.mean(values)), error
 
 
-def _read(path: Path, steps: int) -> dict[str, Any]:
-    """Return the finished rows of a file; raise InputError if they are of other steps."""
+def _read(path: Path, about: dict[str, Any]) -> dict[str, Any]:
+    """Return the finished rows of a file; raise InputError if they are of other steps or tests."""
     if not path.exists():
-        return {"steps": steps, "rows": {}}
+        return {**about, "rows": {}}
     stored: dict[str, Any] = json.loads(path.read_bytes())
-    if stored["steps"] != steps:
-        raise InputError(
-            f"--steps {steps}: {path} has networks of {stored['steps']} steps; give that number, "
-            f"or another --out"
-        )
+    for name, value in about.items():
+        if stored[name] != value:
+            raise InputError(
+                f"{path}: has networks with {name} {stored[name]}, asked for {value}; choose "
+                f"another --out"
+            )
     return stored
 
 
@@ -182,62 +189,70 @@ def _train(
     return train(samples, plan.steps, seed, **options, progress=show)  # type: ignore[arg-type]
 
 
-def _is_real(data: str) -> bool:
-    """Return True for a path below the folder of recordings, False for a street."""
-    return not data.startswith("street")
-
-
 def _map_files(
     parts: Sequence[Part], folder: Path | None, out: Path, progress: Progress | None
 ) -> list[Path]:
     """Make the maps of a training set that are missing, and return the files of all."""
-    files: list[Path] = []
+    files = dict[tuple[Part, int, str], Path]()
     for part in parts:
-        place = out / "maps" / re.sub(r"\W+", "-", part.data.rpartition("/")[2])
-        of_part = {
-            (key, camera): place / f"{key:06d}-{camera}.npz"
+        place = out / "maps" / _file_name(part.data.rpartition("/")[2])
+        for key, camera in product(part.keys, part.cameras):
+            files[part, key, camera] = place / f"{key:06d}-{camera}.npz"
+        missing = [
+            key
             for key in part.keys
-            for camera in part.cameras
-        }
-        files += of_part.values()
-        keys = sorted({key for (key, _), path in of_part.items() if not path.exists()})
-        if not keys:
+            if not all(files[part, key, camera].exists() for camera in part.cameras)
+        ]
+        if not missing:
             continue
         recording = _opened(part, folder)
-        for number, key in enumerate(keys):
+        for number, key in enumerate(missing):
             for camera, arrays in _make_maps(recording, key, part.cameras).items():
-                with file_aside(of_part[key, camera]) as aside:
-                    np.savez_compressed(aside, **arrays)
+                _write_arrays(files[part, key, camera], arrays)
             if progress is not None:
-                progress(f"maps of {part.data}", number + 1, len(keys))
-    return files
+                progress(f"maps of {part.data}", number + 1, len(missing))
+    return [*files.values()]
+
+
+def _file_name(text: str) -> str:
+    """Return the text with a dash for everything that a file name should not have."""
+    return re.sub(r"\W+", "-", text)
+
+
+def _write_arrays(path: Path, arrays: Arrays) -> None:
+    """Write a compressed ``.npz`` file, which appears when it is complete."""
+    with file_aside(path) as aside:
+        np.savez_compressed(aside, **arrays)
 
 
 def _opened(part: Part, folder: Path | None) -> Recording:
     """Open the sweeps of a part, without those before its first key and after its last."""
-    sequence = open_sequence(
-        str(folder / part.data) if folder and _is_real(part.data) else part.data
-    )
-    inner = without_scanner(sequence, -1 if part.scanner is None else part.scanner)
-    inner.frames = [frame for frame in sequence.frames if part.keys[0] <= frame <= part.keys[-1]]
-    return Recording(inner, resolve(None), _WINDOW, part.keys, Cache(), looks_around=True)
+    whole = open_sequence(str(folder / part.data) if folder and part.is_real else part.data)
+    sequence = whole if part.scanner is None else without_scanner(whole, part.scanner)
+    frames = [frame for frame in whole.frames if part.keys[0] <= frame <= part.keys[-1]]
+    own: Any = Altered(sequence, frames=frames)
+    return Recording(own, resolve(None), _WINDOW, part.keys, Cache(), looks_around=True)
 
 
 def _make_maps(recording: Recording, key: int, cameras: Sequence[str]) -> dict[str, Arrays]:
     """Return camera -> image and depth maps of a key, by the names in `TARGETS`."""
     results = densify(recording, key, _METHODS, cameras, with_images=False)
-    sequence, arrays = recording.sequence, dict[str, Arrays]()
-    images = load_images(sequence, key_shots(sequence, choose_cameras(sequence, cameras), key))
-    for camera, image in images.items():
-        ours = results["flow"].depth[camera]
-        arrays[camera] = {
-            "image": image,
-            "focal_px": np.float64(sequence.cameras[camera].focal_px),
+    return {
+        camera: {
             "filled": ours.filled_m,
             "confidence": ours.confidence,
             **{method: result.depth[camera].depth_m for method, result in results.items()},
+            **_image(recording.sequence, key, camera),
         }
-    return arrays
+        for camera, ours in results["flow"].depth.items()
+    }
+
+
+def _image(sequence: LidarSequence, key: int, camera: str) -> Arrays:
+    """Return the image (H,W,3) that a map of the key shows, and its focal length."""
+    shots = key_shots(sequence, choose_cameras(sequence, [camera]), key)
+    focal_px = np.float64(sequence.cameras[camera].focal_px)
+    return {"image": load_images(sequence, shots)[camera], "focal_px": focal_px}
 
 
 def _samples(files: Sequence[Path], target: str) -> list[Sample]:
@@ -268,10 +283,9 @@ def _tests(folder: Path | None, out: Path, progress: Progress | None) -> dict[st
     for number, (name, key) in enumerate(chosen):
         if folder is None and key.is_real:
             continue
-        path = out / "tests" / (re.sub(r"\W+", "-", key.name) + ".npz")
+        path = out / "tests" / f"{_file_name(key.name)}.npz"
         if not path.exists():
-            with file_aside(path) as aside:
-                np.savez_compressed(aside, **_make_test(key, folder))
+            _write_arrays(path, _make_test(key, folder))
         with np.load(path, allow_pickle=False) as kept:
             arrays = dict(kept)
         focal_px = float(arrays["focal_px"])
@@ -287,16 +301,14 @@ def _tests(folder: Path | None, out: Path, progress: Progress | None) -> dict[st
 def _make_test(key: GateKey, folder: Path | None) -> Arrays:
     """Return image, single sweep and truth of a key."""
     subject = Subject.of(key, folder, Cache())
-    truth, sequence = cast(TruthMap, subject.truth), subject.recording.sequence
+    truth = cast(TruthMap, subject.truth)  # none of these keys is held out
     single = densify(subject.recording, key.key, ["none"], [key.camera], with_images=False)
-    shots = key_shots(sequence, choose_cameras(sequence, [key.camera]), key.key)
     return {
-        "image": load_images(sequence, shots)[key.camera],
         "none": single["none"].depth[key.camera].depth_m,
         "truth": truth.depth_m,
         "moving": truth.moving,
-        "focal_px": np.float64(subject.camera.focal_px),
         "baseline_m": np.float64(truth.baseline_m),
+        **_image(subject.recording.sequence, key.key, key.camera),
     }
 
 

@@ -2,7 +2,7 @@
 """Train a small network that completes the depth of a single sweep, guided by the image.
 
 The network is a U-Net (Ronneberger, Fischer, Brox, MICCAI 2015) on sparse depth and image (Ma and
-Karaman, "Sparse-to-Dense", ICRA 2018). Every camera is reduced to a focal length of 400 px, so that
+Karaman, "Sparse-to-Dense", ICRA 2018). Every camera is reduced to a focal length of 500 px, so that
 one network serves several cameras. The same seed gives the same bytes on CPUs of one kind.
 """
 
@@ -23,20 +23,20 @@ from densify.flow.energy import on_one_thread
 from densify.geometry.types import Bool, Float32
 from densify.learning.training import find_device
 
-_FOCAL_PX = 400.0
-_CROP_PX = (112, 176)  # height, width
-_BATCH = 4
-_WIDTHS = (24, 32, 48, 64, 64)  # channels of the levels of the U-Net
-_LEARNING_RATE = 2e-3
+_FOCAL_PX = 500.0
+_CROP_PX = (128, 208)  # height, width
+_BATCH = 2
+_WIDTHS = (16, 32, 48, 64, 64)  # channels of the levels of the U-Net
+_LEARNING_RATE, _WARM_UP = 4e-3, 0.1  # greatest rate, and share of the steps before it
 _LARGEST_GRADIENT = 1.0
 _NUM_COMPARED = 4096  # pixels of a crop on which the loss is taken
 _MOST_TARGETS = 60_000  # pixels of an image that are kept to train on
 _INPUT_SHARE = 0.8  # of the returns, if the others are held out to train on
 _USUAL_LOG_M = 2.7  # where there is no return at all
 _NONE = 99.0  # log depth of a pixel without a return
-_NEIGHBOURHOODS_PX = (7, 15)
-_SMOOTHING_PX = (40.0, 16.0, 7.0, 3.5, 2.0, 1.0)  # standard deviations, the finest last
-_LEAST_DENSITY = 0.003  # of returns, weighted by a Gaussian, at which it is used
+_NEIGHBOURHOODS_PX = (9, 21)
+_SCALES_PX = (0.7, 1.4, 2.8, 5.6, 11.0, 22.0, 45.0)  # standard deviations of Gaussians
+_STEEPNESS = (4.0, 2.0)  # powers of these scales, by which they are weighted
 
 
 class Sample(NamedTuple):
@@ -75,6 +75,8 @@ class Sample(NamedTuple):
         if target_m is not None:
             weights = np.ones(shape, np.float32) if weight is None else weight
             target = _listed(target_m, weights, width, height)
+            if len(target) > _MOST_TARGETS:
+                target = target[np.random.default_rng(0).permutation(len(target))[:_MOST_TARGETS]]
         returns = _listed(sparse_m, sparse_m, width, height)[:, :3]
         small = (small - small.mean((0, 1))) / (small.std() + np.float32(1e-3))
         return Sample(np.ascontiguousarray(small.transpose(2, 0, 1)), returns, target, shape)
@@ -83,9 +85,6 @@ class Sample(NamedTuple):
 def _listed(depth_m: Float32, weight: Float32, width: int, height: int) -> Float32:
     """Return (N,4) column and row in the reduced image, depth, weight of pixels with a depth."""
     row, column = np.nonzero((depth_m > 0) & (weight > 0))
-    if len(row) > _MOST_TARGETS:
-        chosen = np.random.default_rng(0).permutation(len(row))[:_MOST_TARGETS]
-        row, column = row[chosen], column[chosen]
     x = (column + 0.5) * (width / depth_m.shape[1])
     y = (row + 0.5) * (height / depth_m.shape[0])
     return np.stack([x, y, depth_m[row, column], weight[row, column]], 1).astype(np.float32)
@@ -143,19 +142,24 @@ def _log_depths(returns: Float32, shape: tuple[int, ...], with_returns: bool) ->
     np.minimum.at(nearest, (row, column), np.log(returns[:, 2]))
     has_return = (nearest < _NONE).astype(np.float32)
     inverse = has_return * np.exp(-nearest)  # linear over a plane, unlike depth
-    smooth, layers = np.full(shape, np.exp(-_USUAL_LOG_M), np.float32), []
-    for sigma_px in _SMOOTHING_PX:
-        weight = cv2.GaussianBlur(has_return, (0, 0), sigma_px)
-        mean = cv2.GaussianBlur(inverse, (0, 0), sigma_px) / np.maximum(weight, 1e-9)
-        smooth = np.where(weight > _LEAST_DENSITY, mean, smooth)
-        layers.append(-np.log(smooth))
-    layers = layers[: -3 : -1]
+    layers = [_interpolated(inverse, has_return, steepness) for steepness in _STEEPNESS]
     for size in _NEIGHBOURHOODS_PX:
         square = np.ones((size, size), np.uint8)
         low = cv2.erode(nearest, square)
         high = -cv2.erode(np.where(has_return > 0, -nearest, np.float32(_NONE)), square)
         layers += [np.where(low < _NONE, low, layers[0]), np.where(high > -_NONE, high, layers[0])]
     return np.stack([*layers, has_return]).astype(np.float32)
+
+
+def _interpolated(inverse: Float32, has_return: Float32, steepness: float) -> Float32:
+    """Return (h,w) log depth of the mean of returns, weighted by a power of their distance."""
+    total = np.full(inverse.shape, 1e-12 * np.exp(-_USUAL_LOG_M), np.float32)
+    weight = np.full(inverse.shape, 1e-12, np.float32)
+    for sigma_px in _SCALES_PX:
+        share = sigma_px**-steepness
+        total += share * cv2.GaussianBlur(inverse, (0, 0), sigma_px)
+        weight += share * cv2.GaussianBlur(has_return, (0, 0), sigma_px)
+    return np.log(weight / total)
 
 
 def train(
@@ -173,7 +177,7 @@ def train(
 
     Args:
         samples: Samples to train on.
-        steps: Number of steps, of four crops each.
+        steps: Number of steps, of two crops each.
         seed: Seed of weights, order, crops and flips.
         with_returns: False trains on the image alone (monocular depth).
         device: "cpu", "cuda", or "auto" (CUDA if there is one).
@@ -186,7 +190,9 @@ def train(
     network = Completion(with_returns).train()
     network = network.to(device=place_of_work, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.Adam(network.parameters())
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _LEARNING_RATE, total_steps=steps)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, _LEARNING_RATE, total_steps=steps, pct_start=_WARM_UP
+    )
     sizes = np.array([sample.image.shape[1:] for sample in samples])
     height, width = np.minimum(_CROP_PX, sizes.min(0)).tolist()
     with on_one_thread():
@@ -216,13 +222,14 @@ def _crop(
     sample: Sample, size: tuple[int, int], with_returns: bool, rng: np.random.Generator
 ) -> tuple[Float32, Float32, Float32, Float32]:
     """Return image (3,h,w), `_log_depths` (7,h,w), positions (N,2) from -1 to 1, targets (N,2)."""
+    whole = sample.image.shape[1:]
+    top, left = (int(rng.integers(all_px - px + 1)) for all_px, px in zip(whole, size, strict=True))
+    mirrored = rng.random() < 0.5
     returns, target = sample.returns, sample.target
     if target is None:
         is_input = rng.random(len(returns)) < _INPUT_SHARE
         target = np.column_stack([returns[~is_input], np.ones((~is_input).sum(), np.float32)])
         returns = returns[is_input]
-    whole = sample.image.shape[1:]
-    top, left = (int(rng.integers(all_px - px + 1)) for all_px, px in zip(whole, size, strict=True))
     corner, extent = np.array((left, top), np.float32), np.array(size[::-1], np.float32)
     place = 2 * (target[:, :2] - corner) / extent - 1
     within = np.flatnonzero(_inside(place))
@@ -233,7 +240,7 @@ def _crop(
     returns = returns[_inside(2 * (returns[:, :2] - corner) / extent - 1)]
     log_depths = _log_depths(returns - (left, top, 0), size, with_returns)
     image, place = sample.image[:, top : top + size[0], left : left + size[1]], place[chosen]
-    if rng.random() < 0.5:
+    if mirrored:
         image, log_depths = image[..., ::-1], log_depths[..., ::-1]
         place = place * np.array((-1, 1), np.float32)
     return image.copy(), log_depths.copy(), place, target[chosen, 2:]
