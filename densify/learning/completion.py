@@ -24,7 +24,7 @@ from densify.geometry.types import Bool, Float32
 from densify.learning.training import find_device
 
 _FOCAL_PX = 500.0
-_CROP_PX = (128, 208)  # height, width
+_CROP_PX = (112, 176)  # height, width
 _BATCH = 2
 _WIDTHS = (16, 32, 48, 64, 64)  # channels of the levels of the U-Net
 _LEARNING_RATE, _WARM_UP = 4e-3, 0.1  # greatest rate, and share of the steps before it
@@ -35,8 +35,8 @@ _INPUT_SHARE = 0.8  # of the returns, if the others are held out to train on
 _USUAL_LOG_M = 2.7  # where there is no return at all
 _NONE = 99.0  # log depth of a pixel without a return
 _NEIGHBOURHOODS_PX = (9, 21)
-_SCALES_PX = (0.7, 1.4, 2.8, 5.6, 11.0, 22.0, 45.0)  # standard deviations of Gaussians
-_STEEPNESS = (4.0, 2.0)  # powers of these scales, by which they are weighted
+_SQUARES_PX = (1, 3, 5, 7, 11, 17, 25, 37, 57, 87, 131)  # sizes of means
+_STEEPNESS = (5.0, 2.0)  # powers of the sizes, by which the means are weighted
 
 
 class Sample(NamedTuple):
@@ -155,10 +155,10 @@ def _interpolated(inverse: Float32, has_return: Float32, steepness: float) -> Fl
     """Return (h,w) log depth of the mean of returns, weighted by a power of their distance."""
     total = np.full(inverse.shape, 1e-12 * np.exp(-_USUAL_LOG_M), np.float32)
     weight = np.full(inverse.shape, 1e-12, np.float32)
-    for sigma_px in _SCALES_PX:
-        share = sigma_px**-steepness
-        total += share * cv2.GaussianBlur(inverse, (0, 0), sigma_px)
-        weight += share * cv2.GaussianBlur(has_return, (0, 0), sigma_px)
+    for size in _SQUARES_PX:
+        share = size**-steepness
+        total += share * cv2.blur(inverse, (size, size))
+        weight += share * cv2.blur(has_return, (size, size))
     return np.log(weight / total)
 
 
