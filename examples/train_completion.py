@@ -38,7 +38,7 @@ def outliers(network: Completion, folder: str) -> float:
 def main() -> None:
     folder, test, *steps = sys.argv[1:]
     print(f"untrained {outliers(Completion().eval(), test):.2%} outliers against {test}")
-    network = train([sample for sample, *_ in samples(folder)], int(*steps or [400]))
+    network = train([sample for sample, *_ in samples(folder)], int(*steps or [300]))
     print(f"trained   {outliers(network, test):.2%}")
 
 

@@ -105,7 +105,7 @@ class Plan(NamedTuple):
     sets: Sequence[str] = tuple(SETS)  # names of `SETS`
     targets: Sequence[str] = tuple(TARGETS)  # names of `TARGETS`
     seeds: int = 5  # number of networks of each set and kind of maps
-    steps: int = 400  # training steps of each network
+    steps: int = 300  # training steps of each network
     with_returns: bool = True  # False trains on the image alone (monocular depth)
     device: str = "auto"  # "auto", "cpu" or "cuda"
 

@@ -367,7 +367,7 @@ TRUTH  a PNG or a folder
 --sets NAME,…  some of both, streets, KITTI, PandaSet (default: all)
 --maps NAME,…  some of the kinds of maps (default: all)
 --seeds N =5  networks of each set and kind of maps
---steps N =400  training steps of each network
+--steps N =300  training steps of each network
 --image-alone  train on the image alone (monocular depth)
 --device {auto,cpu,cuda} =auto  device to train on
 """,

@@ -27,7 +27,7 @@ _FOCAL_PX = 500.0
 _CROP_PX = (112, 176)  # height, width
 _BATCH = 2
 _WIDTHS = (16, 32, 48, 64, 64)  # channels of the levels of the U-Net
-_LEARNING_RATE, _WARM_UP = 4e-3, 0.1  # greatest rate, and share of the steps before it
+_LEARNING_RATE, _WARM_UP = 2e-3, 0.1  # greatest rate, and share of the steps before it
 _LARGEST_GRADIENT = 1.0
 _NUM_COMPARED = 4096  # pixels of a crop on which the loss is taken
 _MOST_TARGETS = 60_000  # pixels of an image that are kept to train on
@@ -109,7 +109,7 @@ class Completion(nn.Module):
         self._last = nn.Conv2d(_WIDTHS[0], num_choices + 1, 3, 1, 1)
         nn.init.zeros_(self._last.weight)
         with torch.no_grad():
-            self._last.bias.copy_(torch.tensor([4.0] + num_choices * [0.0]))  # type: ignore[union-attr]
+            self._last.bias.copy_(torch.tensor([2.0] + num_choices * [0.0]))  # type: ignore[union-attr]
 
     def forward(self, image: Tensor, log_depths: Tensor) -> Tensor:
         """Return the log depth (N,1,h,w) for images (N,3,h,w) and `_log_depths` (N,7,h,w)."""
