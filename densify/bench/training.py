@@ -85,18 +85,18 @@ TESTS: Mapping[str, tuple[GateKey, ...]] = {
 
 
 TARGETS: Mapping[str, tuple[str, bool]] = {
-    "single sweep, held out": ("", False),
-    "single sweep, IP-Basic": ("ip-basic", False),
+    "single sweep held out": ("", False),
+    "single sweep IP-Basic": ("ip-basic", False),
     "rigid (ICP)": ("icp", False),
-    "rigid, cleaned": ("icp-visible", False),
-    "densify, measured": ("flow", False),
-    "densify, filled": ("filled", False),
-    "densify, filled, by confidence": ("filled", True),
+    "rigid cleaned": ("icp-visible", False),
+    "densify measured": ("flow", False),
+    "densify filled": ("filled", False),
+    "densify filled by confidence": ("filled", True),
 }
 """Kind of depth maps to train on -> name of the stored map, and True to weigh by confidence."""
 
 UNTRAINED = "nothing"
-"""Name of the row of an untrained network, which interpolates the returns."""
+"""Name of the row of an untrained network."""
 
 
 class Plan(NamedTuple):

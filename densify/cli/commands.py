@@ -363,7 +363,7 @@ TRUTH  a PNG or a folder
         "train a network that completes depth on several kinds of maps, and test each",
         """
 --data DIR  folder of real recordings (default: $DENSIFY_TEST_DATA; without, streets alone)
---out DIR =densify-training  folder of maps and results; the same command continues in it
+--out DIR =densify-out/training  folder of maps and results; the same command continues in it
 --sets NAME,…  some of both, streets, KITTI, PandaSet (default: all)
 --maps NAME,…  some of the kinds of maps (default: all)
 --seeds N =5  networks of each set and kind of maps

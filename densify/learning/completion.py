@@ -94,7 +94,7 @@ class Completion(nn.Module):
     """A U-Net that weighs six depths of each pixel, and adds a change of its own.
 
     The six are two weighted means of the returns around, and the nearest and the farthest return in
-    two squares. An untrained network interpolates.
+    two squares. An untrained network takes their mean, mostly of the first.
     """
 
     def __init__(self, with_returns: bool = True) -> None:
