@@ -20,10 +20,9 @@ def samples(folder: str) -> Iterator[tuple[Sample, np.ndarray, float]]:
     """Yield each sample of a set with its dense depth (H,W) in metres and its focal length."""
     for maps in densify.DepthDataset(folder):
         focal_px = float(maps["intrinsics"][0, 0])
-        names = ("sparse_depth_m", "dense_depth_m", "confidence")
-        sparse_m, dense_m, confidence = (maps[name][0].numpy() for name in names)
+        sparse_m, dense_m = (maps[name][0].numpy() for name in ("sparse_depth_m", "dense_depth_m"))
         image = maps["image"].numpy()
-        yield Sample.of(image, sparse_m, dense_m, confidence, focal_px=focal_px), dense_m, focal_px
+        yield Sample.of(image, sparse_m, dense_m, focal_px=focal_px), dense_m, focal_px
 
 
 def outliers(network: Completion, folder: str) -> float:

@@ -129,6 +129,7 @@ def bench_training(
         if unknown := [name for name in names if name not in known]:
             raise InputError(f"got {unknown[0]!r}, expected some of {'; '.join(known)}")
     sets = [name for name in plan.sets if folder or not SETS[name][0].is_real]
+    plan = plan._replace(sets=sets)
     maps = {name: _map_files(SETS[name], folder, out, progress) for name in sets}
     tests = _tests(folder, out, progress)
     path = out / ("training.json" if plan.with_returns else "training-image-alone.json")
