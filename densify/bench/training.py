@@ -142,7 +142,7 @@ def bench_training(
         for target in plan.targets
     }
     if UNTRAINED not in rows:
-        rows[UNTRAINED] = _errors(Completion(plan.with_returns).eval(), tests)
+        rows[UNTRAINED] = _errors(Completion(plan.with_returns).train(False), tests)
     read = lru_cache(len(plan.targets))(lambda name, target: _samples(maps[name], target))
     for number, (row, (name, target, seed)) in enumerate(wanted.items()):
         if row not in rows:

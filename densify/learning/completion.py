@@ -215,7 +215,7 @@ def train(
             schedule.step()
             if progress is not None:
                 progress(step + 1)
-    return network.eval()
+    return network.train(False)
 
 
 def _crop(
