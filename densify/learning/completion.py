@@ -190,8 +190,9 @@ def train(
     network = Completion(with_returns).train()
     network = network.to(device=place_of_work, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.Adam(network.parameters())
+    num_steps = max(steps, 2)  # the rise needs two of them
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, _LEARNING_RATE, total_steps=steps, pct_start=_WARM_UP
+        optimiser, _LEARNING_RATE, total_steps=num_steps, pct_start=max(_WARM_UP, 2 / num_steps)
     )
     sizes = np.array([sample.image.shape[1:] for sample in samples])
     height, width = np.minimum(_CROP_PX, sizes.min(0)).tolist()
