@@ -78,6 +78,9 @@ def slow_errors(pixels, fb):
     means = {name: total / len(pixels) for name, total in sums.items()}
     for name in ("rmse_m", "irmse_per_km"):
         means[name] = math.sqrt(means[name])
+    logs = [math.log(z / t) for z, t in pixels]
+    mean = sum(logs) / len(logs)
+    means["silog"] = math.sqrt(sum((log - mean) ** 2 for log in logs) / len(logs))
     return means
 
 

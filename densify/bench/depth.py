@@ -72,7 +72,7 @@ class TruthMap(NamedTuple):
 
 
 class Altered:
-    """A recording with altered sweeps or other recorded poses; all else is as recorded.
+    """A recording with altered or fewer sweeps or other recorded poses; all else is as recorded.
 
     ``sweep`` alters each sweep. ``T_world_lidar`` maps a frame to its pose. None changes nothing.
     """
@@ -82,8 +82,10 @@ class Altered:
         sequence: Any,
         sweep: Callable[[Sweep], Sweep] | None = None,
         T_world_lidar: Callable[[int], Float] | None = None,
+        frames: Sequence[int] | None = None,
     ) -> None:
         self._sequence, self._alter = sequence, sweep
+        self.frames = sequence.frames if frames is None else frames
         if T_world_lidar is not None:
             self.T_world_lidar = T_world_lidar
 

@@ -8,14 +8,16 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-from densify.bench import baselines, gate, paper
+from densify.bench import baselines, gate, paper, training
 from densify.bench.depth import bench_depth
 from densify.bench.doctor import bench_doctor
 from densify.bench.flow import DEFAULT_METHODS, bench_flow, tables
+from densify.bench.training import mean_and_error
 from densify.bench.verdicts import Verdict, verdicts
 from densify.cli.options import config_of, recording_of, recordings_of
-from densify.cli.screen import Answer, aligned, numbers_table, percent, progress_on_stderr
+from densify.cli.screen import Answer, aligned, numbers_table, percent, progress_on_stderr, written
 from densify.config import as_mapping, resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
@@ -23,6 +25,21 @@ from densify.readers import open_sequence
 from densify.scores.depth_metrics import LEAST_PIXELS, DepthErrors
 
 _KEYS = [120]
+_FIGURES = {
+    "outliers": ("all", "outliers", ".2%"),
+    "moving": ("moving", "outliers", ".2%"),
+    "static": ("static", "outliers", ".2%"),
+    "edges": ("edge", "outliers", ".2%"),
+    "MAE m": ("all", "mae_m", ".3f"),
+    "RMSE m": ("all", "rmse_m", ".2f"),
+    "iRMSE 1/km": ("all", "irmse_per_km", ".2f"),
+}
+"""Column of ``bench training`` -> part of the pixels, error, format."""
+_FIGURES_OF_IMAGE = {
+    "log error": ("all", "silog", ".4f"),
+    "moving": ("moving", "silog", ".4f"),
+    "static": ("static", "silog", ".4f"),
+}
 _UNSEEN = (
     "street?seed=41@70",
     "street:crossing?seed=42@90",
@@ -47,14 +64,19 @@ def answer_bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
     yield Answer(facts={"config": as_mapping(config)})
 
 
+def _recordings_folder(options: argparse.Namespace) -> Path | None:
+    """Return the folder of real recordings of ``--data``, or of the environment; None without."""
+    named = os.environ.get("DENSIFY_TEST_DATA")
+    return options.data or (Path(named) if named else None)
+
+
 def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify bench gate``: yield the verdicts of each group; store figures if asked."""
     kinds = gate.KINDS if options.only is None else options.only
     for kind in kinds:
         if kind not in gate.KINDS:
             raise InputError(f"--only {kind}: expected some of {', '.join(gate.KINDS)}")
-    named = os.environ.get("DENSIFY_TEST_DATA")
-    data = options.data or (Path(named) if named else None)
+    data = _recordings_folder(options)
     stored = gate.read(options.stored) if options.stored.exists() else gate.Stored({}, {})
     with progress_on_stderr() as progress:
         now = gate.measure(data, kinds, options.keys, options.draws, progress, Cache())
@@ -77,8 +99,7 @@ def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
 
 def answer_bench_baselines(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify bench baselines``: yield the errors of simpler maps and ours, by truth."""
-    named = os.environ.get("DENSIFY_TEST_DATA")
-    folder = options.data or (Path(named) if named else None)
+    folder = _recordings_folder(options)
     titles = ["", "part", "pixels", "coverage", "outliers", "over 1 px", "MAE"]
     for truth, keys in baselines.GROUPS.items():
         if folder is None and keys[0].is_real:
@@ -100,6 +121,38 @@ def _error_cells(errors: DepthErrors) -> list[str]:
         return [*cells, "–", "–", "–"]
     shares = [percent(errors.outliers), percent(errors.outliers_1_px)]
     return [*cells, *shares, f"{errors.mae_m:.2f} m"]
+
+
+def answer_bench_training(options: argparse.Namespace) -> Iterator[Answer]:
+    """Answer ``densify bench training``: yield a table for each test."""
+    plan = training.Plan(
+        options.sets or tuple(training.SETS),
+        options.maps or tuple(training.TARGETS),
+        options.seeds,
+        options.steps,
+        not options.image_alone,
+        options.device,
+    )
+    with progress_on_stderr() as progress:
+        networks = training.bench_training(_recordings_folder(options), options.out, plan, progress)
+    figures = _FIGURES_OF_IMAGE if options.image_alone else _FIGURES
+    tests = next(of_seeds[0] for maps in networks.values() for of_seeds in maps.values())
+    for test in tests:
+        rows = [
+            [name, of, *(_mean_cell(of_seeds, test, *figure) for figure in figures.values())]
+            for name, maps in networks.items()
+            for of, of_seeds in maps.items()
+        ]
+        yield Answer(aligned([[test, "trained on", *figures], *rows]) + "\n")
+    yield Answer(facts={"networks": networks})
+
+
+def _mean_cell(of_seeds: list[dict[str, Any]], test: str, part: str, error: str, form: str) -> str:
+    """Return the mean of an error over networks, and its standard error, as a cell."""
+    values = [value for of in of_seeds if (value := of[test][part][error]) is not None]
+    mean, error_of_mean = mean_and_error(values)
+    of_mean = "" if error_of_mean is None else f" ± {written(error_of_mean, form)}"
+    return written(mean, form) + of_mean
 
 
 def _verdict_cells(verdict: Verdict) -> list[str]:

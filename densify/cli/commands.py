@@ -361,6 +361,24 @@ TRUTH  a PNG or a folder
         "their code stays the same.",
     ),
     Verb(
+        "bench training",
+        "bench",
+        "train a network that completes depth on several kinds of maps, and test each",
+        """
+--data DIR  folder of real recordings (default: $DENSIFY_TEST_DATA; without, streets alone)
+--out DIR =densify-out/training  folder of maps and results; the same command continues in it
+--sets NAME,…  some of both, streets, KITTI, PandaSet (default: all)
+--maps NAME,…  some of the kinds of maps (default: all)
+--seeds N =5  networks of each set and kind of maps
+--steps N =300  training steps of each network
+--image-alone  train on the image alone (monocular depth)
+--device {auto,cpu,cuda} =auto  device to train on
+""",
+        "Networks of one seed start from the same weights and see the same crops. Tables have the "
+        "mean and its standard error over seeds. Tests: KITTI's stereo benchmark, PandaSet's "
+        "second scanner, exact depth of streets. No sweep of a test was used for training.",
+    ),
+    Verb(
         "bench readme",
         "bench",
         "make the tables of docs/flow-results.md as Markdown on stdout; all take half an hour",

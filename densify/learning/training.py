@@ -79,7 +79,7 @@ class Training:
 
 def train(training: Training, out: Path, progress: Progress | None = None) -> float:
     """Train a network, write the model to ``out``, and return the mean of its last 50 losses."""
-    loss_of, device = TEACHERS[training.teacher], _device(training.device)
+    loss_of, device = TEACHERS[training.teacher], find_device(training.device)
     if training.steps < 1:
         raise InputError(f"--steps {training.steps}: expected 1 or more")
     network = build(training.seed).to(device).train()
@@ -108,7 +108,7 @@ def train(training: Training, out: Path, progress: Progress | None = None) -> fl
     return float(np.mean(losses[-_NUM_AVERAGED:]))
 
 
-def _device(name: str) -> torch.device:
+def find_device(name: str) -> torch.device:
     """Return the torch device for "cpu", "cuda", or "auto" (CUDA if available)."""
     has_cuda = torch.cuda.is_available()
     if name == "cuda" and not has_cuda:

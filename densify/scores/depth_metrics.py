@@ -53,6 +53,8 @@ class DepthErrors:
     # Scene Flow for Autonomous Vehicles", CVPR 2015)
     outliers: float | None
     outliers_1_px: float | None  # share of pixels whose disparity is off by more than 1 px
+    # Standard deviation of ln(z/t), the scale-invariant error (Eigen et al., NIPS 2014)
+    silog: float | None
 
 
 def depth_errors(
@@ -99,6 +101,7 @@ def depth_errors(
         delta_3=_mean(ratio < _DELTA**3),
         outliers=_mean(is_outlier_depth(z, t, focal_px, baseline_m)),
         outliers_1_px=_mean(focal_px * baseline_m * np.abs(1 / z - 1 / t) > 1),
+        silog=float(np.std(np.log(z / t))) if num_compared else None,
     )
 
 

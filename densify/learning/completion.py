@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: MIT
+"""Train a small network that completes the depth of a single sweep, guided by the image.
+
+The network is a U-Net (Ronneberger, Fischer, Brox, MICCAI 2015) on sparse depth and image (Ma and
+Karaman, "Sparse-to-Dense", ICRA 2018). Every camera is reduced to a focal length of 500 px, so that
+one network serves several cameras. The same seed gives the same bytes on CPUs of one kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample, interpolate
+
+from densify.config.errors import InputError
+from densify.flow.energy import on_one_thread
+from densify.geometry.types import Bool, Float32
+from densify.learning.training import find_device
+
+_FOCAL_PX = 500.0
+_CROP_PX = (112, 176)  # height, width
+_BATCH = 2
+_WIDTHS = (16, 32, 48, 64, 64)  # channels of the levels of the U-Net
+_LEARNING_RATE, _WARM_UP = 2e-3, 0.1  # greatest rate, and share of the steps before it
+_LARGEST_GRADIENT = 1.0
+_NUM_COMPARED = 4096  # pixels of a crop on which the loss is taken
+_MOST_TARGETS = 60_000  # pixels of an image that are kept to train on
+_INPUT_SHARE = 0.8  # of the returns, if the others are held out to train on
+_USUAL_LOG_M = 2.7  # where there is no return at all
+_NONE = 99.0  # log depth of a pixel without a return
+_NEIGHBOURHOODS_PX = (9, 21)
+_SQUARES_PX = (1, 3, 5, 7, 11, 17, 25, 37, 57, 87, 131)  # sizes of means
+_STEEPNESS = (5.0, 2.0)  # powers of the sizes, by which the means are weighted
+
+
+class Sample(NamedTuple):
+    """An image with a sparse depth, and depths to train on, reduced to the common focal length."""
+
+    image: Float32  # (3,h,w) RGB with mean 0 and deviation 1
+    returns: Float32  # (R,3) column, row in px of the reduced image, 0 at its corner; depth in m
+    # (T,4) as ``returns``, and weight; None to hold out returns at random
+    target: Float32 | None
+    shape: tuple[int, int]  # (H,W) of the original image
+
+    @staticmethod
+    def of(
+        image: Float32,
+        sparse_m: Float32,
+        target_m: Float32 | None = None,
+        weight: Float32 | None = None,
+        *,
+        focal_px: float,
+    ) -> Sample:
+        """Reduce a sample of `densify.DepthDataset`, or maps of one's own.
+
+        Args:
+            image: (3,H,W) RGB, 0 to 1.
+            sparse_m: (H,W) depth of the single sweep in metres, 0 for none.
+            target_m: (H,W) depth to train on in metres, 0 for none. None holds out a fifth of the
+                sweep's pixels, others at every step.
+            weight: (H,W) weight of each target in the loss, such as its confidence; None for 1.
+            focal_px: Focal length fx of the image.
+        """
+        shape = sparse_m.shape[0], sparse_m.shape[1]
+        scale = min(1.0, _FOCAL_PX / focal_px)
+        height, width = (max(1, round(scale * size)) for size in shape)
+        small = cv2.resize(image.transpose(1, 2, 0), (width, height), interpolation=cv2.INTER_AREA)
+        target = None
+        if target_m is not None:
+            weights = np.ones(shape, np.float32) if weight is None else weight
+            target = _listed(target_m, weights, width, height)
+            if len(target) > _MOST_TARGETS:
+                target = target[np.random.default_rng(0).permutation(len(target))[:_MOST_TARGETS]]
+        returns = _listed(sparse_m, sparse_m, width, height)[:, :3]
+        small = (small - small.mean((0, 1))) / (small.std() + np.float32(1e-3))
+        return Sample(np.ascontiguousarray(small.transpose(2, 0, 1)), returns, target, shape)
+
+
+def _listed(depth_m: Float32, weight: Float32, width: int, height: int) -> Float32:
+    """Return (N,4) column and row in the reduced image, depth, weight of pixels with a depth."""
+    row, column = np.nonzero((depth_m > 0) & (weight > 0))
+    x = (column + 0.5) * (width / depth_m.shape[1])
+    y = (row + 0.5) * (height / depth_m.shape[0])
+    return np.stack([x, y, depth_m[row, column], weight[row, column]], 1).astype(np.float32)
+
+
+class Completion(nn.Module):
+    """A U-Net that weighs six depths of each pixel, and adds a change of its own.
+
+    The six are two weighted means of the returns around, and the nearest and the farthest return in
+    two squares. An untrained network takes their mean, mostly of the first.
+    """
+
+    def __init__(self, with_returns: bool = True) -> None:
+        """Make a network; without returns, it sees the image alone."""
+        super().__init__()
+        self.with_returns = with_returns
+        levels = list(pairwise(_WIDTHS))
+        num_choices = 2 + 2 * len(_NEIGHBOURHOODS_PX)
+        self._first = _convolution(3 + num_choices + 1, _WIDTHS[0], 2)
+        self._down = nn.ModuleList(_convolution(a, b, 2) for a, b in levels)
+        self._up = nn.ModuleList(_convolution(b + a, a) for a, b in levels)
+        self._last = nn.Conv2d(_WIDTHS[0], num_choices + 1, 3, 1, 1)
+        nn.init.zeros_(self._last.weight)
+        with torch.no_grad():
+            self._last.bias.copy_(torch.tensor([2.0] + num_choices * [0.0]))  # type: ignore[union-attr]
+
+    def forward(self, image: Tensor, log_depths: Tensor) -> Tensor:
+        """Return the log depth (N,1,h,w) for images (N,3,h,w) and `_log_depths` (N,7,h,w)."""
+        choices, base = log_depths[:, :-1], log_depths[:, :1]
+        inputs = [image, base - _USUAL_LOG_M, choices[:, 1:] - base, log_depths[:, -1:]]
+        x = self._first(torch.cat(inputs, 1).contiguous(memory_format=torch.channels_last))
+        skips = []
+        for down in self._down:
+            skips.append(x)
+            x = down(x)
+        for up, skip in zip(reversed(self._up), reversed(skips), strict=True):
+            x = up(torch.cat([interpolate(x, skip.shape[2:]), skip], 1))
+        x = interpolate(self._last(x), image.shape[2:], mode="bilinear")
+        return (x[:, :-1].softmax(1) * choices).sum(1, keepdim=True) + x[:, -1:]
+
+
+def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    """Return a convolution of 3 x 3 pixels with its activation."""
+    layer = nn.Conv2d(inputs, outputs, 3, stride, 1)
+    nn.init.kaiming_normal_(layer.weight, 0.1)
+    return nn.Sequential(layer, nn.LeakyReLU(0.1))
+
+
+def _log_depths(returns: Float32, shape: tuple[int, ...], with_returns: bool) -> Float32:
+    """Return (7,h,w): `Completion`'s six log depths, and 1 where there is a return."""
+    if not with_returns:
+        returns = np.zeros((0, 3), np.float32)
+    nearest = np.full(shape, _NONE, np.float32)
+    column, row = returns[:, :2].astype(int).T
+    np.minimum.at(nearest, (row, column), np.log(returns[:, 2]))
+    has_return = (nearest < _NONE).astype(np.float32)
+    inverse = has_return * np.exp(-nearest)  # linear over a plane, unlike depth
+    layers = [_interpolated(inverse, has_return, steepness) for steepness in _STEEPNESS]
+    for size in _NEIGHBOURHOODS_PX:
+        square = np.ones((size, size), np.uint8)
+        low = cv2.erode(nearest, square)
+        high = -cv2.erode(np.where(has_return > 0, -nearest, np.float32(_NONE)), square)
+        layers += [np.where(low < _NONE, low, layers[0]), np.where(high > -_NONE, high, layers[0])]
+    return np.stack([*layers, has_return]).astype(np.float32)
+
+
+def _interpolated(inverse: Float32, has_return: Float32, steepness: float) -> Float32:
+    """Return (h,w) log depth of the mean of returns, weighted by a power of their distance."""
+    total = np.full(inverse.shape, 1e-12 * np.exp(-_USUAL_LOG_M), np.float32)
+    weight = np.full(inverse.shape, 1e-12, np.float32)
+    for size in _SQUARES_PX:
+        share = size**-steepness
+        total += share * cv2.blur(inverse, (size, size))
+        weight += share * cv2.blur(has_return, (size, size))
+    return np.log(weight / total)
+
+
+def train(
+    samples: Sequence[Sample],
+    steps: int,
+    seed: int = 0,
+    *,
+    with_returns: bool = True,
+    device: str = "auto",
+    progress: Callable[[int], None] | None = None,
+) -> Completion:
+    """Train a network by Adam on crops, with the mean absolute error of the log depth as loss.
+
+    Networks of one seed start from the same weights and see the same crops in the same order.
+
+    Args:
+        samples: Samples to train on.
+        steps: Number of steps, of two crops each.
+        seed: Seed of weights, order, crops and flips.
+        with_returns: False trains on the image alone (monocular depth).
+        device: "cpu", "cuda", or "auto" (CUDA if there is one).
+        progress: Function called with the number of finished steps.
+    """
+    if not samples or steps < 1:
+        raise InputError(f"got {len(samples)} samples and {steps} steps, expected 1 or more")
+    torch.manual_seed(seed)
+    place_of_work = find_device(device)
+    network = Completion(with_returns).train()
+    network = network.to(device=place_of_work, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimiser = torch.optim.Adam(network.parameters())
+    num_steps = max(steps, 2)  # the rise needs two of them
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, _LEARNING_RATE, total_steps=num_steps, pct_start=max(_WARM_UP, 2 / num_steps)
+    )
+    sizes = np.array([sample.image.shape[1:] for sample in samples])
+    height, width = np.minimum(_CROP_PX, sizes.min(0)).tolist()
+    with on_one_thread():
+        for step in range(steps):
+            rng = np.random.default_rng([seed, step])
+            chosen = rng.choice(len(samples), _BATCH, replace=len(samples) < _BATCH)
+            drawn = [_crop(samples[row], (height, width), with_returns, rng) for row in chosen]
+            image, log_depths, place, target = (
+                torch.from_numpy(np.stack(arrays)).to(place_of_work)
+                for arrays in zip(*drawn, strict=True)
+            )
+            log_m = grid_sample(network(image, log_depths), place[:, None], align_corners=False)
+            true_m, weight = target.unbind(-1)
+            error = (log_m[:, 0, 0] - true_m.log()).abs()
+            loss = (weight * error).sum() / weight.sum().clamp(min=1e-9)
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
+            optimiser.step()
+            schedule.step()
+            if progress is not None:
+                progress(step + 1)
+    return network.train(False)
+
+
+def _crop(
+    sample: Sample, size: tuple[int, int], with_returns: bool, rng: np.random.Generator
+) -> tuple[Float32, Float32, Float32, Float32]:
+    """Return image (3,h,w), `_log_depths` (7,h,w), positions (N,2) from -1 to 1, targets (N,2)."""
+    whole = sample.image.shape[1:]
+    top, left = (int(rng.integers(all_px - px + 1)) for all_px, px in zip(whole, size, strict=True))
+    mirrored = rng.random() < 0.5
+    returns, target = sample.returns, sample.target
+    if target is None:
+        is_input = rng.random(len(returns)) < _INPUT_SHARE
+        target = np.column_stack([returns[~is_input], np.ones((~is_input).sum(), np.float32)])
+        returns = returns[is_input]
+    corner, extent = np.array((left, top), np.float32), np.array(size[::-1], np.float32)
+    place = 2 * (target[:, :2] - corner) / extent - 1
+    within = np.flatnonzero(_inside(place))
+    if not len(within):  # no depth to compare with: no weight
+        place, within = np.zeros((1, 2), np.float32), np.zeros(1, int)
+        target = np.array([[0, 0, 1, 0]], np.float32)
+    chosen = within[(rng.random(_NUM_COMPARED) * len(within)).astype(int)]
+    returns = returns[_inside(2 * (returns[:, :2] - corner) / extent - 1)]
+    log_depths = _log_depths(returns - (left, top, 0), size, with_returns)
+    image, place = sample.image[:, top : top + size[0], left : left + size[1]], place[chosen]
+    if mirrored:
+        image, log_depths = image[..., ::-1], log_depths[..., ::-1]
+        place = place * np.array((-1, 1), np.float32)
+    return image.copy(), log_depths.copy(), place, target[chosen, 2:]
+
+
+def _inside(place: Float32) -> Bool:
+    """Return (N,) True for positions (N,2) between -1 and 1."""
+    column, row = place.T
+    inside: Bool = (column > -1) & (column < 1) & (row > -1) & (row < 1)
+    return inside
+
+
+def predict(network: Completion, sample: Sample) -> Float32:
+    """Return the depth (H,W) in metres of every pixel of the original image."""
+    log_depths = _log_depths(sample.returns, sample.image.shape[1:], network.with_returns)
+    device = next(network.parameters()).device
+    inputs = [torch.from_numpy(array)[None].to(device) for array in (sample.image, log_depths)]
+    with torch.no_grad(), on_one_thread():
+        log_m = interpolate(network(*inputs), sample.shape, mode="bilinear")
+        depth_m: Float32 = log_m[0, 0].exp().cpu().numpy()
+    return depth_m
