@@ -190,7 +190,7 @@ def train(
     network = Completion(with_returns).train()
     network = network.to(device=place_of_work, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.Adam(network.parameters())
-    num_steps = max(steps, 2)  # the rise needs two of them
+    num_steps = max(steps, 3)  # the rise needs two of them, the fall one
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, _LEARNING_RATE, total_steps=num_steps, pct_start=max(_WARM_UP, 2 / num_steps)
     )
