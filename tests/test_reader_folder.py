@@ -272,8 +272,7 @@ def test_images_by_names_file_and_sweeps(tmp_path):
 def test_the_documented_example_is_right(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "your-recording.md").read_text("utf-8")
     read = FolderConfig.read(config(tmp_path, text.split("```yaml\n")[1].split("```")[0]))
-    assert read.sweeps.compensated and read.poses.T_frame_lidar[2, 3] == 1.6
-    assert next(iter(read.cameras.values())).K[0, 0] == 1000
+    assert read.sweeps.time == "t" and read.cameras["front"].K[0, 0] == 1000
 
 
 # --- damage ---------------------------------------------------------------------------------------

@@ -153,7 +153,7 @@ def test_what_is_no_capture_is_refused_in_a_line(tmp_path, content, says):
 def test_without_the_package_the_remedy_is_named(vlp16, monkeypatch, package, reader, scene):
     monkeypatch.setitem(sys.modules, package, None)
     (vlp16.parent / "drive.json").write_text("{}")
-    with pytest.raises(InputError, match=rf"pip install 'densify-lidar\[{reader}\]'"):
+    with pytest.raises(InputError, match=rf"pip install '\.\[{reader}\]'"):
         open_sequence(f"{reader}:{vlp16}#{scene}")
 
 
