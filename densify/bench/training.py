@@ -186,8 +186,14 @@ def _train(
         if progress is not None:
             progress("train", row * plan.steps + step, num_steps)
 
-    options = {"with_returns": plan.with_returns, "device": plan.device}
-    return train(samples, plan.steps, seed, **options, progress=show)  # type: ignore[arg-type]
+    return train(
+        samples,
+        plan.steps,
+        seed,
+        with_returns=plan.with_returns,
+        device=plan.device,
+        progress=show,
+    )
 
 
 def _map_files(

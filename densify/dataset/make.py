@@ -25,6 +25,7 @@ from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError, is_out_of_memory
 from densify.dataset.executor import call_all, logged_to
 from densify.dataset.manifest import (
+    USUAL_SHARES,
     Key,
     KeyRecord,
     Manifest,
@@ -58,9 +59,7 @@ from densify.version import __version__
 _log = logging.getLogger("densify")
 _KEYS_PER_PROCESS = 8  # fewer are done before another process has started
 _BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # memory per process, and per sweep of 64 rings
-# Name of a score in a manifest line -> title, and the share that 95 % of 20 keys of a KITTI drive
-# stay below: smaller shares are usual
-_JUDGED = {"ghost": ("ghosts", 0.0075), "outliers": ("held-out outliers", 0.009)}
+_JUDGED = {"ghost": "ghosts", "outliers": "held-out outliers"}
 Shard = tuple[int, int]
 """(i, n), part i of n, from 1."""
 
@@ -112,8 +111,7 @@ def make_dataset(
     Args:
         data: Recordings, as `densify.open_sequence` takes them.
         out: Folder of the training set.
-        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``; no start or stop
-            means the first frame or the last. None for all.
+        keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``. None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
         num_workers: Number of processes, as many as possible if None. More than one needs ``if
             __name__ == "__main__"`` in a script.
@@ -129,8 +127,6 @@ def make_dataset(
         raise InputError(f"data: got {data!r}, expected a list of recordings, such as ['street']")
     out, recipe = Path(out), recipe or Recipe()
     check_engine(recipe.config.flow.engine)
-    if preview is not None and preview < 1:
-        raise InputError(f"--preview {preview}: expected 1 key or more")
     planned = plan(data, keys, recipe)
     drives = planned if preview is None else choose_spread(planned, preview)
     _check_folder(out)
@@ -150,10 +146,8 @@ def make_dataset(
             _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
             outcomes = call_all(make_key, groups, num_workers, log, scheduler)
             summary = _record(outcomes, manifest, records, num_keys, report)
-            if recipe.gate.max_ratio is not None and preview is None:
-                worse = worse_than_neighbours(records, recipe.gate.max_ratio)
-                keep = partial(_keep_picture, out, {drive.name: drive for drive in drives})
-                records |= {record.name: record for record in manifest.set_aside(worse, keep)}
+            if preview is None:
+                records |= _set_aside(manifest, records, recipe, out, drives)
             clear_leftovers(out, age_s)  # hidden folders of killed workers
     return summary
 
@@ -279,6 +273,21 @@ def _record(
     return summary
 
 
+def _set_aside(
+    manifest: Manifest,
+    records: Mapping[Key, KeyRecord],
+    recipe: Recipe,
+    out: Path,
+    drives: Sequence[Drive],
+) -> dict[Key, KeyRecord]:
+    """Put keys far worse than their neighbours aside, and return their new records."""
+    if recipe.gate.max_ratio is None:
+        return {}
+    worse = worse_than_neighbours(records, recipe.gate.max_ratio)
+    keep = partial(_keep_picture, out, {drive.name: drive for drive in drives})
+    return {record.name: record for record in manifest.set_aside(worse, keep)}
+
+
 def _keep_picture(
     out: Path, drives: Mapping[str, Drive], record: KeyRecord
 ) -> dict[str, FileRecord]:
@@ -309,9 +318,9 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
         drive.sort(key=lambda record: record.key)
         # Twice a window: the keys whose windows an end cuts are the minority of neighbours.
         num_beside = 2 * max(len(record.frames) for record in drive)
-        for score, (title, usual_share) in _JUDGED.items():
+        for score, title in _JUDGED.items():
             shares = [max(record.values_of(score), default=np.nan) for record in drive]
-            for row, median in _outlying(shares, num_beside, usual_share, max_ratio):
+            for row, median in _outlying(shares, num_beside, USUAL_SHARES[score][1], max_ratio):
                 if drive[row].status == "done":
                     worse[drive[row].name].append(
                         f"{title} {100 * shares[row]:.2g} %, more than {max_ratio:g} times the "

@@ -41,6 +41,16 @@ _STATUSES: tuple[Status, ...] = ("failed", "aside", "done")  # from worst to bes
 _log = logging.getLogger("densify")
 
 
+USUAL_SHARES: Mapping[str, tuple[float, float]] = {
+    "ghost": (0.0005, 0.0075),
+    "outliers": (0.0006, 0.009),
+    "density": (0.36, 0.50),
+    "density_filled": (0.49, 0.62),
+}
+"""Score of a manifest line -> range of 5 to 95 % of 20 keys of KITTI's drive 2011_09_26 0013
+(frames 96 to 134, every second, window 5)."""
+
+
 @dataclass(frozen=True)
 class KeyRecord:
     """The outcome of one key sweep, with the fields of a manifest line."""

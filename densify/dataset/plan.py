@@ -165,8 +165,11 @@ def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]
 def choose_spread(drives: Sequence[Drive], num_keys: int) -> list[Drive]:
     """Return the recordings with ``num_keys`` of their keys alone, spread evenly over all keys.
 
-    The first is half a step after the start, because windows are cut at the ends.
+    The first is half a step after the start, because windows are cut at the ends. InputError is
+    raised for fewer than 1 key.
     """
+    if num_keys < 1:
+        raise InputError(f"preview {num_keys}: expected 1 key or more")
     names = [(drive.name, key) for drive in drives for key in drive.keys]
     rows = (np.arange(num_keys) + 0.5) * len(names) / num_keys
     chosen = {names[int(row)] for row in rows}

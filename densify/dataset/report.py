@@ -18,7 +18,13 @@ import yaml
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.dataset.manifest import KeyRecord, describe_pace, describe_rest, read_manifests
+from densify.dataset.manifest import (
+    USUAL_SHARES,
+    KeyRecord,
+    describe_pace,
+    describe_rest,
+    read_manifests,
+)
 from densify.dataset.pictures import (
     FILLED,
     PICTURE_FOLDER,
@@ -53,8 +59,7 @@ class _Score(NamedTuple):
     of: Callable[[KeyRecord], float | None]  # the value in ``unit``, None if unknown
     is_bad: float  # 1 if a high value is bad, -1 if a low value is, 0 if neither
     limit: str = ""  # name of the limit in the recipe
-    # 5 to 95 % of 20 keys of KITTI's drive 2011_09_26 0013 (96:136:2, window 5), in ``unit``
-    usual: tuple[float, float] | None = None
+    usual: tuple[float, float] | None = None  # range on KITTI, in ``unit``
 
 
 def _percent(name: str) -> Callable[[KeyRecord], float | None]:
@@ -67,22 +72,23 @@ def _percent(name: str) -> Callable[[KeyRecord], float | None]:
     return of
 
 
-def _share(name: str, title: str, is_bad: float, limit: str, usual: tuple[float, float]) -> _Score:
+def _share(name: str, title: str, is_bad: float, limit: str = "") -> _Score:
     """Return a score that is a share."""
-    return _Score(name, title, "%", _percent(name), is_bad, limit, usual)
+    low, high = USUAL_SHARES[name]
+    return _Score(name, title, "%", _percent(name), is_bad, limit, (100 * low, 100 * high))
 
 
 _SCORES = (
-    _share("ghost", "Ghosts", 1, "max_ghost", (0.05, 0.75)),
-    _share("outliers", "Held-out outliers", 1, "max_outliers", (0.06, 0.9)),
-    _share("density", "Measured depth", -1, "min_density", (36.0, 50.0)),
-    _share("density_filled", "Filled depth", -1, "", (49.0, 62.0)),
+    _share("ghost", "Ghosts", 1, "max_ghost"),
+    _share("outliers", "Held-out outliers", 1, "max_outliers"),
+    _share("density", "Measured depth", -1, "min_density"),
+    _share("density_filled", "Filled depth", -1),
     _Score("seconds", "Computing time", "s", lambda record: record.seconds, 0),
 )
 
 
 class _Set(NamedTuple):
-    """What the parts of the page of a training set read."""
+    """The content of a training set, from which the parts of its page are made."""
 
     root: Path
     table: Mapping[str, Any]  # content of dataset.json
@@ -208,7 +214,7 @@ def _facts(made: _Set) -> Callable[[_Score], Iterable[str]]:
         if score.limit and gate[score.limit] is not None:
             limits.append(f"{score.limit[:3]}. {_text(100.0 * gate[score.limit])} {unit}")
         if score.limit in ("max_ghost", "max_outliers") and gate["max_ratio"] is not None:
-            limits.append(f"{gate['max_ratio']:g} × the neighbours' median")
+            limits.append(f"usual, {gate['max_ratio']:g} × the neighbours' median")
         usual = "" if score.usual is None else f"{score.usual[0]:g} to {score.usual[1]:g} {unit}"
         if not values:
             return _cells([score.title, "not computed", "", "; ".join(limits), usual])
@@ -225,7 +231,11 @@ def _recipe(table: Mapping[str, Any]) -> str:
     limits = [
         text.format(scale * gate[name])
         for name, scale, text in (
-            ("max_ratio", 1, "its ghosts or held-out outliers exceed {:g} times its neighbours'"),
+            (
+                "max_ratio",
+                1,
+                "its ghosts or held-out outliers are more than usual and {:g} × its neighbours'",
+            ),
             ("max_ghost", 100, "its ghosts exceed {:g} %"),
             ("max_outliers", 100, "its held-out outliers exceed {:g} %"),
             ("min_density", 100, "less than {:g} % of the pixels have a measured depth"),

@@ -271,7 +271,7 @@ class Ouster(FileSequence):
 def count_lost_and_repeated(turn: Int, column: Int) -> tuple[int, int]:
     """Return the number of packets missing between P others, and of those captured twice.
 
-    ``turn`` (P,) is the number of each packet's turn, of 16 bits, so that it starts again from 0.
+    ``turn`` (P,) numbers each packet's turn with 16 bits: 0 follows 65535.
     ``column`` (P,) is the first column of each packet.
     """
     step = np.diff(turn, prepend=turn[:1])

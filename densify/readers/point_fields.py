@@ -188,8 +188,7 @@ def find_times(
     extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
     middle, reach = np.median(extents, axis=0).tolist()
     span = max(float(np.ptp(values)) for values in finite) if any(map(len, finite)) else 0.0
-    dtype = sweeps[0].dtype
-    name = field.name
+    name, dtype = field.name, sweeps[0].dtype
 
     # Times that cannot be used: too few digits, all equal, or a span of no unit
     if dtype.kind == "f" and np.spacing(dtype.type(abs(middle))) * _FEWEST_STEPS > span > 0:
@@ -207,8 +206,7 @@ def find_times(
             f"{1e-6 * period_ns:.0f} ms from sweep to sweep; name its unit"
         )
     middles_ns = extents[:, 0] * UNIT_NS[unit]
-    middle_ns = middle * UNIT_NS[unit]
-    reach_ns = reach * UNIT_NS[unit]
+    middle_ns, reach_ns = middle * UNIT_NS[unit], reach * UNIT_NS[unit]
 
     # Absolute times are large or advance from sweep to sweep.
     absolute = field.absolute

@@ -73,8 +73,7 @@ def follow_road(
     for registered, surface in zip(window_sweeps, window_surfaces, strict=True):
         chain.insert(surface.points, registered.T_world_lidar)
     latest = window_sweeps[-1]
-    T_world_lidar = latest.T_world_lidar
-    latest_ns = latest.sweep.stamp_ns
+    T_world_lidar, latest_ns = latest.T_world_lidar, latest.sweep.stamp_ns
     is_backwards = len(frames) > 0 and stamp_ns[0] < latest_ns
     twist = latest.twist_before if is_backwards else latest.twist_after
     speed_m_s = float(np.linalg.norm(twist[3:]))
