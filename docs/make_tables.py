@@ -3,9 +3,10 @@
 
 python docs/make_tables.py [FILE]
 
-FILE, printed by ``densify bench baselines --json``, replaces errors in docs/numbers.json. Costs
-are entered there by hand. ``densify bench gate --write`` writes tests/gate.json. A table stands
-between ``<!-- table: NAME -->`` and ``<!-- end -->``. Prose quotes a figure as a link to its table.
+FILE, printed by ``densify bench baselines --json`` or ``densify bench training --json``, replaces
+errors in docs/numbers.json. Costs are entered there by hand. ``densify bench gate --write`` writes
+tests/gate.json. A table stands between ``<!-- table: NAME -->`` and ``<!-- end -->``. Prose quotes
+a figure as a link to its table.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from densify.bench import gate
+from densify.bench.training import mean_and_error
 from densify.bench.verdicts import coverage, outliers_at
 from densify.scores.depth_metrics import LEAST_PIXELS
 
@@ -127,6 +129,53 @@ def of_gate(stored: gate.Stored, keys: Sequence[str], figure: str) -> str:
     return share(cell, stored, keys, figure)
 
 
+def training(networks: Any) -> str:
+    """Return the table of outliers of networks that were trained on all real recordings."""
+    rows = [[kind, *training_cells(tests)] for kind, tests in networks["both"].items()]
+    return table(["trained on", *training_titles(networks)], rows)
+
+
+def other_training(networks: Any) -> str:
+    """Return the table of outliers of networks that were trained on other recordings."""
+    rows = [
+        [name, kind, *training_cells(tests)]
+        for name, kinds in networks.items()
+        if name != "both"
+        for kind, tests in kinds.items()
+    ]
+    return table(["recordings", "trained on", *training_titles(networks)], rows)
+
+
+def training_titles(networks: Any) -> list[str]:
+    """Return the titles of the columns of `training_cells`."""
+    tests = next(iter(networks["both"].values()))
+    return [f"{test.split(',')[0]}, {part}" for test, parts in tests.items() for part in parts]
+
+
+def training_cells(tests: Any) -> list[str]:
+    """Return outliers in % with their standard error, for each test and part of the pixels."""
+    means_and_errors = [both for parts in tests.values() for both in parts.values()]
+    return [f"{mean:.2f} ± {error:.2f}" for mean, error in means_and_errors]
+
+
+def training_figures(networks: Any) -> Any:
+    """Return set -> kind of maps -> test -> part -> mean outliers in % and standard error."""
+    return {
+        name: {
+            kind: {
+                test: {
+                    part: mean_and_error([100 * of[test][part]["outliers"] for of in of_seeds])
+                    for part in ("all", "moving")
+                }
+                for test in of_seeds[0]
+            }
+            for kind, of_seeds in kinds.items()
+        }
+        for name, kinds in networks.items()
+        if name
+    }
+
+
 ERRORS: dict[str, Callable[[Any], str]] = {
     "outliers over 3 px in % (coverage)": lambda cell: (
         f"{100 * cell['outliers']:.2f} ({cell['coverage']:.2f})"
@@ -169,9 +218,13 @@ def with_tables(page: str) -> str:
     numbers, stored = json.loads(NUMBERS.read_text()), gate.read(ROOT / "tests/gate.json")
     makers = {f.__name__: f for f in (headline, comparison, judged, baselines)}
 
+    of_training = {f.__name__: f for f in (training, other_training)}
+
     def made(found: re.Match[str]) -> str:
         if found[2] == "cost":
             text = table(["task", "CPU", "elapsed", "memory"], numbers["cost"])
+        elif found[2] in of_training:
+            text = of_training[found[2]](numbers["training"])
         else:
             text = makers[found[2]](numbers["baselines"], stored)
         return f"{found[1]}{text}\n{found[3]}"
@@ -183,6 +236,8 @@ def main() -> None:
     """Store the errors that are given, and write the tables of all pages."""
     for name in sys.argv[1:]:
         measured, numbers = json.loads(Path(name).read_text()), json.loads(NUMBERS.read_text())
+        for name, kinds in training_figures(measured.get("networks", {})).items():
+            numbers["training"].setdefault(name, {}).update(kinds)
         for truth in TRUTHS.keys() & measured.keys():
             numbers["baselines"][truth] = {
                 method: {part: {f: cell[f] for f in FIGURES} for part, cell in parts.items()}

@@ -81,11 +81,11 @@ def test_training_repeats_byte_for_byte_and_seeds_differ() -> None:
         assert first.tobytes() == again.tobytes() != other.tobytes()
 
 
-@pytest.mark.parametrize("steps", [1, 2, 10, 11])
-def test_any_number_of_steps_trains(steps: int) -> None:
+@pytest.mark.parametrize("size, steps", [("small", s) for s in (1, 2, 10, 11)] + [("large", 1)])
+def test_any_number_of_steps_trains(size: str, steps: int) -> None:
     image, true_m, sparse_m = scene(0)
     sample = Sample.of(image, sparse_m, true_m, focal_px=FOCAL_PX)
-    assert np.isfinite(predict(train([sample], steps, device="cpu"), sample)).all()
+    assert np.isfinite(predict(train([sample], steps, size=size, device="cpu"), sample)).all()
 
 
 def test_the_image_alone_is_used_without_returns() -> None:

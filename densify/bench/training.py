@@ -27,7 +27,7 @@ from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.depth.exposure import key_shots, load_images
 from densify.geometry.types import LidarSequence, Progress
-from densify.learning.completion import Completion, Sample, predict, train
+from densify.learning.completion import SIZES, Completion, Sample, predict, train
 from densify.outputs.atomic import file_aside, write_json
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import densify
@@ -105,7 +105,8 @@ class Plan(NamedTuple):
     sets: Sequence[str] = tuple(SETS)  # names of `SETS`
     targets: Sequence[str] = tuple(TARGETS)  # names of `TARGETS`
     seeds: int = 5  # number of networks of each set and kind of maps
-    steps: int = 300  # training steps of each network
+    network: str = "small"  # name in `completion.SIZES`
+    steps: int | None = None  # training steps of each network; None for those of its size
     with_returns: bool = True  # False trains on the image alone (monocular depth)
     device: str = "auto"  # "auto", "cpu" or "cuda"
 
@@ -129,11 +130,13 @@ def bench_training(
         if unknown := [name for name in names if name not in known]:
             raise InputError(f"got {unknown[0]!r}, expected some of {'; '.join(known)}")
     sets = [name for name in plan.sets if folder or not SETS[name][0].is_real]
-    plan = plan._replace(sets=sets)
+    steps = SIZES[plan.network].steps if plan.steps is None else plan.steps
+    plan = plan._replace(sets=sets, steps=steps)
     maps = {name: _map_files(SETS[name], folder, out, progress) for name in sets}
     tests = _tests(folder, out, progress)
-    path = out / ("training.json" if plan.with_returns else "training-image-alone.json")
-    stored = _read(path, {"steps": plan.steps, "tests": [*tests]})
+    size = "" if plan.network == "small" else f"-{plan.network}"
+    path = out / f"training{size}{'' if plan.with_returns else '-image-alone'}.json"
+    stored = _read(path, {"steps": steps, "tests": [*tests]})
     rows: dict[str, Any] = stored["rows"]
     wanted = {
         f"{name} | {target} | {seed}": (name, target, seed)
@@ -142,7 +145,8 @@ def bench_training(
         for target in plan.targets
     }
     if UNTRAINED not in rows:
-        rows[UNTRAINED] = _errors(Completion(plan.with_returns).train(False), tests)
+        untrained = Completion(plan.with_returns, plan.network).train(False)
+        rows[UNTRAINED] = _errors(untrained, tests)
     read = lru_cache(len(plan.targets))(lambda name, target: _samples(maps[name], target))
     for number, (row, (name, target, seed)) in enumerate(wanted.items()):
         if row not in rows:
@@ -180,16 +184,18 @@ def _train(
     samples: Sequence[Sample], plan: Plan, seed: int, row: int, progress: Progress | None
 ) -> Completion:
     """Train the network of a row, and show the progress of all rows."""
-    num_steps = len(plan.sets) * len(plan.targets) * plan.seeds * plan.steps
+    steps = cast(int, plan.steps)
+    num_steps = len(plan.sets) * len(plan.targets) * plan.seeds * steps
 
     def show(step: int) -> None:
         if progress is not None:
-            progress("train", row * plan.steps + step, num_steps)
+            progress("train", row * steps + step, num_steps)
 
     return train(
         samples,
-        plan.steps,
+        steps,
         seed,
+        size=plan.network,
         with_returns=plan.with_returns,
         device=plan.device,
         progress=show,

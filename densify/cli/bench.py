@@ -129,6 +129,7 @@ def answer_bench_training(options: argparse.Namespace) -> Iterator[Answer]:
         options.sets or tuple(training.SETS),
         options.maps or tuple(training.TARGETS),
         options.seeds,
+        options.network,
         options.steps,
         not options.image_alone,
         options.device,

@@ -370,7 +370,8 @@ TRUTH  a PNG or a folder
 --sets NAME,…  some of both, streets, KITTI, PandaSet (default: all)
 --maps NAME,…  some of the kinds of maps (default: all)
 --seeds N =5  networks of each set and kind of maps
---steps N =300  training steps of each network
+--network {small,large} =small  0.24 million weights, or 1.2 million, for a GPU
+--steps N  training steps of each network (default: 300; large: 1500)
 --image-alone  train on the image alone (monocular depth)
 --device {auto,cpu,cuda} =auto  device to train on
 """,

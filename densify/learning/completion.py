@@ -25,9 +25,7 @@ from densify.learning.training import find_device
 
 _FOCAL_PX = 500.0
 _CROP_PX = (112, 176)  # height, width
-_BATCH = 2
-_WIDTHS = (16, 32, 48, 64, 64)  # channels of the levels of the U-Net
-_LEARNING_RATE, _WARM_UP = 2e-3, 0.1  # greatest rate, and share of the steps before it
+_WARM_UP = 0.1  # share of the steps before the greatest learning rate
 _LARGEST_GRADIENT = 1.0
 _NUM_COMPARED = 4096  # pixels of a crop on which the loss is taken
 _MOST_TARGETS = 60_000  # pixels of an image that are kept to train on
@@ -37,6 +35,22 @@ _NONE = 99.0  # log depth of a pixel without a return
 _NEIGHBOURHOODS_PX = (9, 21)
 _SQUARES_PX = (1, 3, 5, 7, 11, 17, 25, 37, 57, 87, 131)  # sizes of means
 _STEEPNESS = (5.0, 2.0)  # powers of the sizes, by which the means are weighted
+
+
+class Size(NamedTuple):
+    """Size of a network, and how it is trained."""
+
+    widths: tuple[int, ...]  # channels of the levels of the U-Net
+    steps: int  # usual number of training steps
+    batch: int  # crops of a step
+    learning_rate: float  # greatest rate
+
+
+SIZES = {
+    "small": Size((16, 32, 48, 64, 64), steps=300, batch=2, learning_rate=2e-3),
+    "large": Size((32, 64, 96, 144, 192), steps=1500, batch=8, learning_rate=1e-3),
+}
+"""Name of a size -> a network of 0.24 million weights for a CPU, or of 1.2 million for a GPU."""
 
 
 class Sample(NamedTuple):
@@ -97,16 +111,17 @@ class Completion(nn.Module):
     two squares. An untrained network takes their mean, mostly of the first.
     """
 
-    def __init__(self, with_returns: bool = True) -> None:
-        """Make a network; without returns, it sees the image alone."""
+    def __init__(self, with_returns: bool = True, size: str = "small") -> None:
+        """Make a network of a size of `SIZES`; without returns, it sees the image alone."""
         super().__init__()
         self.with_returns = with_returns
-        levels = list(pairwise(_WIDTHS))
+        widths = SIZES[size].widths
+        levels = list(pairwise(widths))
         num_choices = 2 + 2 * len(_NEIGHBOURHOODS_PX)
-        self._first = _convolution(3 + num_choices + 1, _WIDTHS[0], 2)
+        self._first = _convolution(3 + num_choices + 1, widths[0], 2)
         self._down = nn.ModuleList(_convolution(a, b, 2) for a, b in levels)
         self._up = nn.ModuleList(_convolution(b + a, a) for a, b in levels)
-        self._last = nn.Conv2d(_WIDTHS[0], num_choices + 1, 3, 1, 1)
+        self._last = nn.Conv2d(widths[0], num_choices + 1, 3, 1, 1)
         nn.init.zeros_(self._last.weight)
         with torch.no_grad():
             self._last.bias.copy_(torch.tensor([2.0] + num_choices * [0.0]))  # type: ignore[union-attr]
@@ -164,10 +179,11 @@ def _interpolated(inverse: Float32, has_return: Float32, steepness: float) -> Fl
 
 def train(
     samples: Sequence[Sample],
-    steps: int,
+    steps: int | None = None,
     seed: int = 0,
     *,
     with_returns: bool = True,
+    size: str = "small",
     device: str = "auto",
     progress: Callable[[int], None] | None = None,
 ) -> Completion:
@@ -177,29 +193,35 @@ def train(
 
     Args:
         samples: Samples to train on.
-        steps: Number of steps, of two crops each.
+        steps: Number of steps; None takes that of the size.
         seed: Seed of weights, order, crops and flips.
         with_returns: False trains on the image alone (monocular depth).
+        size: Size of the network, a name in `SIZES`.
         device: "cpu", "cuda", or "auto" (CUDA if there is one).
         progress: Function called with the number of finished steps.
     """
+    of_size = SIZES[size]
+    steps = of_size.steps if steps is None else steps
     if not samples or steps < 1:
         raise InputError(f"got {len(samples)} samples and {steps} steps, expected 1 or more")
     torch.manual_seed(seed)
     place_of_work = find_device(device)
-    network = Completion(with_returns).train()
+    network = Completion(with_returns, size).train()
     network = network.to(device=place_of_work, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.Adam(network.parameters())
     num_steps = max(steps, 3)  # the rise needs two of them, the fall one
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, _LEARNING_RATE, total_steps=num_steps, pct_start=max(_WARM_UP, 2 / num_steps)
+        optimiser,
+        of_size.learning_rate,
+        total_steps=num_steps,
+        pct_start=max(_WARM_UP, 2 / num_steps),
     )
     sizes = np.array([sample.image.shape[1:] for sample in samples])
     height, width = np.minimum(_CROP_PX, sizes.min(0)).tolist()
     with on_one_thread():
         for step in range(steps):
             rng = np.random.default_rng([seed, step])
-            chosen = rng.choice(len(samples), _BATCH, replace=len(samples) < _BATCH)
+            chosen = rng.choice(len(samples), of_size.batch, replace=len(samples) < of_size.batch)
             drawn = [_crop(samples[row], (height, width), with_returns, rng) for row in chosen]
             image, log_depths, place, target = (
                 torch.from_numpy(np.stack(arrays)).to(place_of_work)
