@@ -27,12 +27,10 @@ from densify.depth.votes import (
     ROUNDED,
     Voters,
     extend,
-    inverse_of,
     offset,
-    steps_to_known,
     votes_for,
 )
-from densify.geometry.arrays import Bool, Float, Float32
+from densify.geometry.arrays import Bool, Float
 from densify.geometry.compiled import Kernel, inlined
 
 LEAST_SHARE = 0.97
@@ -69,12 +67,9 @@ def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
 
 
 def fill(record: MapRecord, reach: float) -> None:
-    """Fill pixels between measured pixels where nine tenths of the votes (`votes_for`) agree.
-
-    The record changes in place, ``reach`` is as in `fill_between`. Others are rejected.
-    """
+    """Fill pixels as `fill_between`; reject those with less than nine tenths of the votes."""
     empty = record.filled_m == 0
-    fill_between(record.filled_m, record.tilt, record.spacing_px, reach)
+    fill_between(record, reach)
     _reject_unconfirmed(record, empty, _FILL_SHARE)
 
 
@@ -104,8 +99,8 @@ class _Known(NamedTuple):
     inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
 
 
-def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: float) -> None:
-    """Interpolate empty pixels that have measured pixels on both sides, in place.
+def fill_between(record: MapRecord, reach: float) -> None:
+    """Interpolate empty pixels of the record that have measured pixels on both sides, in place.
 
     The window around an empty pixel must hold measured pixels to its left, to its right, above and
     below: nothing is extrapolated. No depth discontinuity may run through them. There is a
@@ -115,22 +110,11 @@ def fill_between(filled_m: Float32, tilt: Float32, spacing_px: Float32, reach: f
     The pixel gets the depth of the weighted plane in inverse depth. The half size of the window
     grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
     is taken.
-
-    Args:
-        filled_m: (H,W) depths of the measured pixels, 0 elsewhere; the filled depths are added.
-        tilt: (H,W,2) slopes as in `MapRecord`; those of filled pixels are added.
-        spacing_px: (H,W,2) spacing of rays across and down.
-        reach: Half size of the largest window in spacings of rays.
     """
     sizes = min(reach, 1.0) * np.arange(1, _NUM_SIZES + 1) / _NUM_SIZES
     reaches = np.append(sizes, reach) if reach > 1 else sizes
-    known = _known_pixels(filled_m)
-    _fill.over_rows(filled_m.size, known, spacing_px, reaches, filled_m, tilt)
-
-
-def _known_pixels(depth_m: Float32) -> _Known:
-    """Return the pixels with a depth of a map (H,W)."""
-    is_known = depth_m > 0
+    filled_m = record.filled_m
+    is_known = filled_m > 0
     height, width = is_known.shape
     before = np.zeros((height, width + 1), np.int32)
     np.cumsum(is_known, axis=1, dtype=np.int32, out=before[:, 1:])
@@ -138,7 +122,8 @@ def _known_pixels(depth_m: Float32) -> _Known:
     np.cumsum(before, axis=0, out=num[1:])
     before += num[:-1, -1:]  # the pixels of the rows above
     column = np.nonzero(is_known)[1].astype(np.int32)
-    return _Known(before, num, column, inverse=1 / depth_m[is_known].astype(np.float64))
+    known = _Known(before, num, column, inverse=1 / filled_m[is_known].astype(np.float64))
+    _fill.over_rows(filled_m.size, known, record.spacing_px, reaches, filled_m, record.tilt)
 
 
 @inlined
@@ -248,7 +233,7 @@ def fill_stars(record: MapRecord) -> None:
     empty = record.filled_m == 0
     pixel = np.flatnonzero(empty)
     predicted_m = np.zeros(len(pixel), np.float32)
-    known = Voters(steps_to_known(~empty), inverse_of(record.filled_m), record.tilt)
+    known = Voters.of(record.filled_m, record.tilt)
     _star.over_rows(len(pixel), pixel, known, record.spacing_px, predicted_m)
     record.filled_m.flat[pixel] = predicted_m
     _reject_unconfirmed(record, empty, _STAR_SHARE)

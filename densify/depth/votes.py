@@ -47,17 +47,10 @@ def to_lab(image: NDArray[np.uint8]) -> Float32:
     return colours * np.float32(max(1.0, _LEAST_LIGHT / max(lightest, 1.0)))
 
 
-def _directions() -> NDArray[np.int64]:
-    """Return the `DIRECTIONS`."""
-    right, below, diagonal = (1, 0), (0, 1), (1, 1)
-    # Four directions, from the right to almost below. Turned by quarters they give all.
-    quarter = np.array([(right, (2, 0)), (right, (2, 1)), (diagonal, (2, 2)), (below, (1, 2))])
-    quarter_turn = np.array([[0, -1], [1, 0]])
-    quarters = [quarter @ np.linalg.matrix_power(quarter_turn, k).T for k in range(4)]
-    return np.concatenate(quarters).astype(np.int64)
-
-
-DIRECTIONS = _directions()
+# Four directions, from the right to almost below. Turned by quarters they give all.
+_QUARTER = np.array([[(1, 0), (2, 0)], [(1, 0), (2, 1)], [(1, 1), (2, 2)], [(0, 1), (1, 2)]])
+_TURN = np.array([[0, -1], [1, 0]])
+DIRECTIONS = np.concatenate([_QUARTER @ np.linalg.matrix_power(_TURN, k).T for k in range(4)])
 """(16,2,2) offsets (columns, rows) after one step and after two steps in 16 directions, clockwise
 from the right. Each step goes to one of the eight neighbours."""
 
@@ -67,7 +60,7 @@ def steps_to_known(known: Bool) -> NDArray[np.uint8]:
     # Two steps reach at most two pixels beyond the image: there is a border of two on each side.
     padded = np.full((len(DIRECTIONS), known.shape[0] + 4, known.shape[1] + 4), NONE, np.uint8)
     steps = padded[:, 2:-2, 2:-2]
-    steps[:] = np.where(known, np.uint8(0), np.uint8(NONE))
+    np.copyto(steps, 0, where=known)
     _march(padded)
     return steps
 
@@ -127,10 +120,12 @@ class Voters(NamedTuple):
     inverse: Float32  # (H,W) inverse depth in 1/m, 0 where the depth is unknown
     tilt: Float32  # (H,W,2) slope of the inverse depth to the right and down, 1/m per px
 
-
-def inverse_of(depth_m: Float32) -> Float32:
-    """Return the inverse depths (H,W) in 1/m, 0 where there is no depth."""
-    return np.divide(1, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
+    @staticmethod
+    def of(depth_m: Float32, tilt: Float32) -> Voters:
+        """Return the pixels of a map (H,W) with a depth above 0."""
+        known = depth_m > 0
+        inverse = np.divide(1, depth_m, out=np.zeros_like(depth_m), where=known)
+        return Voters(steps_to_known(known), inverse, tilt)
 
 
 def votes_for(
@@ -140,24 +135,22 @@ def votes_for(
 
     The first known pixel in each of 16 directions votes, up to 6 ray spacings away. It votes for
     the depth if its own surface, extended to the pixel, has that depth to 0.2 m and 6 %, otherwise
-    against. Edges of the image, and distance, weaken votes.
+    against. Edges of the record's image, and distance, weaken votes.
 
     Args:
-        record: Record with the image, the slopes and the spacing of rays.
         maps_m: Depths (H,W) of the pixels that vote, 0 for other pixels. The least share of the
             maps counts.
-        pixel: (P,) flat indices (row · W + column) of the pixels to confirm.
-        depth_m: (P,) depths to confirm.
-        with_shifts: True takes the least share of five positions of the image, with a small
-            constant vote. The image is unshifted, and shifted by 0.6 ray spacings to each side.
-            False takes the unshifted image; the share is 0 without voters.
+        pixel: (P,) flat indices of the pixels, whose depths ``depth_m`` (P,) are to be confirmed.
+        with_shifts: Take the least share of five positions of the image, unshifted and shifted by
+            0.6 ray spacings to each side, with a small constant vote. Otherwise the image is
+            unshifted, and the share is 0 without voters.
     """
     shares = np.ones((len(maps_m), len(pixel)), np.float32)
     # The kernel is compiled for each memory layout of its arrays: here they have one.
     tilt, inverse = np.ascontiguousarray(record.tilt), 1 / depth_m
     colours, gap_px = np.ascontiguousarray(record.lab), record.gap_px
     for map_m, share in zip(maps_m, shares, strict=True):
-        voters = Voters(steps_to_known(map_m > 0), inverse_of(map_m), tilt)
+        voters = Voters.of(map_m, tilt)
         _vote.over_rows(len(pixel), pixel, inverse, voters, colours, gap_px, with_shifts, share)
     return shares.min(axis=0)
 
