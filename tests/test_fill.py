@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify.depth import fill as stage
-from densify.depth import votes
 from densify.depth.exposure import PointsInImage
 from densify.depth.fill import (
+    DIRECTIONS,
     accept_boundary_pixels,
     fill,
     fill_between,
     fill_stars,
     measure_spots,
+    votes_for,
 )
 from densify.depth.patches import HIDDEN_FRACTION, HIDDEN_M
-from densify.depth.votes import DIRECTIONS, votes_for
 from tests.depth_scenes import record_of
 
 SHAPE = (60, 80)
@@ -36,8 +36,8 @@ def vote_twin(record, pixel, depth_m, surely):
     """One pixel, one direction, one step at a time."""
     height, width = SMALL
     v, u = divmod(pixel, width)
-    gap, least, doubt = record.gap_px[v, u], 1.0, votes._DOUBT if surely else 0.0
-    aside = round(votes._SHIFT * gap) if surely else 0
+    gap, least, doubt = record.gap_px[v, u], 1.0, stage._DOUBT if surely else 0.0
+    aside = round(stage._SHIFT * gap) if surely else 0
 
     def colour(row, column):
         row, column = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
@@ -51,7 +51,7 @@ def vote_twin(record, pixel, depth_m, surely):
                 du, dv = step // 2 * u2 + step % 2 * u1, step // 2 * v2 + step % 2 * v1
                 if not (0 <= u + du < width and 0 <= v + dv < height):
                     break
-                if max(abs(du), abs(dv)) > votes.VOTERS_REACH * gap:
+                if max(abs(du), abs(dv)) > stage.VOTERS_REACH * gap:
                     break
                 off = colour(v + down + dv, u + right + du) - colour(v + down, u + right)
                 change = max(change, off @ off)
@@ -59,8 +59,8 @@ def vote_twin(record, pixel, depth_m, surely):
                     known = 1 / record.depth_m[v + dv, u + du]
                     predicted = known - record.tilt[v + dv, u + du] @ (du, dv)
                     predicted = min(max(predicted, known / 1.4), 1.4 * known)
-                    weight = np.exp(-change / (2 * votes._COLOURS**2)) + votes._ACROSS_EDGE
-                    weight /= 1 + step / (votes._DECAY * gap)
+                    weight = np.exp(-change / (2 * stage._COLOURS**2)) + stage._ACROSS_EDGE
+                    weight /= 1 + step / (stage._DECAY * gap)
                     same_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
                     all_votes += weight
                     votes_for += weight * (abs(1 / predicted - depth_m) <= same_m)

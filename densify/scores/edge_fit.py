@@ -130,7 +130,7 @@ def depth_edges(points: Float) -> Silhouettes:
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
-    """Return `View.strength` of an (H,W,3) RGB image, resized to 700 px of focal length, and scale."""
+    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
