@@ -219,10 +219,22 @@ def find_moving_bodies(
         if any(exposure.see(corners, velocity_m_s).inside.any() for exposure in exposures):
             shown_rows[instance], hulls[instance] = rows, corners
             velocities[instance] = velocity_m_s
-    return {
-        instance: _body(cloud, instance, hulls[instance], velocities[instance], toward)
-        for instance, toward in rays_toward(cloud, rays, shown_rows, hulls).items()
-    }
+
+    bodies = {}
+    for instance, toward in rays_toward(cloud, rays, shown_rows, hulls).items():
+        corners = hulls[instance]
+        near = select_rows(toward, passes_near(corners, toward.start, toward.to_return))
+        enter, leave = find_crossing(half_spaces(corners), near.start, near.to_return)
+        meets = (enter > 0) & (enter < np.minimum(leave, 1))  # 0 is the origin, 1 the return
+        rows, start, to_return = select_rows(near, meets)
+        bodies[instance] = MovingBody(
+            corners=corners,
+            velocity_m_s=velocities[instance],
+            entries=start + enter[meets, None] * to_return,
+            ends=cloud.moving[rows] & (cloud.instance[rows] == instance),
+            frame=cloud.frame[rows],
+        )
+    return bodies
 
 
 def without_sweep(
@@ -249,23 +261,6 @@ def _hull_corners(points: Float) -> Float:
         return points[:0]
 
 
-def _body(
-    cloud: Cloud, instance: int, corners: Float, velocity_m_s: Float32, rays: ObjectRays
-) -> MovingBody:
-    """Return the body with this hull (V,3), and those of the ``rays`` that meet the hull."""
-    near = select_rows(rays, passes_near(corners, rays.start, rays.to_return))
-    enter, leave = find_crossing(half_spaces(corners), near.start, near.to_return)
-    meets = (enter > 0) & (enter < np.minimum(leave, 1))  # 0 is the origin, 1 the return
-    rows, start, to_return = select_rows(near, meets)
-    return MovingBody(
-        corners=corners,
-        velocity_m_s=velocity_m_s,
-        entries=start + enter[meets, None] * to_return,
-        ends=cloud.moving[rows] & (cloud.instance[rows] == instance),
-        frame=cloud.frame[rows],
-    )
-
-
 def complete_boxes(
     tracks: Sequence[ObjectTrack], cloud: Cloud, rays: Rays, ground: HeightMap
 ) -> tuple[ObjectTrack, ...]:
@@ -276,10 +271,14 @@ def complete_boxes(
     in the world frame of the sweeps.
     """
     tracks = [_lower_to_ground(track, rays, ground) for track in tracks]
-    reach = {track.instance: _reach_corners(track, rays.key) for track in tracks}
-    rows_of = {
-        instance: np.flatnonzero(cloud.moving & (cloud.instance == instance)) for instance in reach
-    }
+    reach, rows_of = dict[int, Float](), dict[int, Int]()
+    for track in tracks:
+        # The space into which the box may grow, at both ends of each axis
+        reach_m = track.size_m + 2 * (_missing_m(track.size_m) + _BESIDE_M)
+        T_key_object = track.T_key_object[track.frames.index(rays.key)]
+        reach[track.instance] = poses.transform(T_key_object, corners_of(reach_m))
+        is_own = cloud.moving & (cloud.instance == track.instance)
+        rows_of[track.instance] = np.flatnonzero(is_own)
     toward = rays_toward(cloud, rays, rows_of, reach)
     return tuple(_complete_box(track, toward[track.instance], rays.key) for track in tracks)
 
@@ -303,13 +302,6 @@ def _lower_to_ground(track: ObjectTrack, rays: Rays, ground: HeightMap) -> Objec
     bottom = corners[::2]  # every other corner
     above_m = float(np.median(ground.above(poses.transform(T_world_key, bottom))))
     return grow_box(track, 2, max(above_m, 0.0), 0.0)
-
-
-def _reach_corners(track: ObjectTrack, key: int) -> Float:
-    """Return the (8,3) corners, key frame, of the space into which a track's box may grow."""
-    growth_m = 2 * (_missing_m(track.size_m) + _BESIDE_M)  # at both ends of each axis
-    T_key_object = track.T_key_object[track.frames.index(key)]
-    return poses.transform(T_key_object, corners_of(track.size_m + growth_m))
 
 
 def corners_of(size_m: Float) -> Float:

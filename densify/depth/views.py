@@ -378,8 +378,7 @@ class HeldOut:
 
         elevation_spacing_m = seen.patches.spacing_m[:, 1]
         gap_rad = elevation_spacing_m / np.linalg.norm(key_cloud.points, axis=1)
-        # Points out of view have no patch, and so no spacing.
-        gap_rad = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
+        gap_rad = gap_rad[gap_rad > 0]  # points out of view have no patch
         return HeldOut(views, truth_m, moving, float(np.median(gap_rad)) if len(gap_rad) else 0.0)
 
     def judged_maps(self, seen: SeenCloud, visible: bool) -> dict[str, JudgedMap]:
@@ -429,8 +428,4 @@ class HeldOut:
         unjudged = to_return_px > self.gap_rad * exposure.camera.focal_px
         filled = depth_map.filled_m > 0
         moving = fronts(bodies.values(), exposure) > 0
-        masks = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
-        return {
-            part: float(unjudged[mask].mean()) if mask.any() else None
-            for part, mask in masks.items()
-        }
+        return depth_metrics.shares_by_motion(unjudged[filled], moving[filled])

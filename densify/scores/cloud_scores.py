@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud
-from densify.scores.depth_metrics import mean_of
+from densify.scores.depth_metrics import mean_of, shares_by_motion
 
 _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 
@@ -52,8 +52,8 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
     hundredths = np.rint(np.abs(cloud.since_key_ns[rows]) / 1e7).astype(np.int64)
     return {
         "num_points": len(rows),
-        **_by_motion(ghost, moving),
-        "unjudged": _by_motion(unjudged, moving),
+        **shares_by_motion(ghost, moving),
+        "unjudged": shares_by_motion(unjudged, moving),
         "by_distance": {str(steps): rate for steps, rate in _rates(ghost, distance).items()},
         "by_seconds": {f"{h / 100:.2f}": rate for h, rate in _rates(ghost, hundredths).items()},
     }
@@ -62,12 +62,6 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
 def _others(cloud: Cloud, key: int) -> Bool:
     """Return (M,) True for points of the window that are not from the key sweep."""
     return (cloud.frame != key) & ~cloud.far
-
-
-def _by_motion(mask: Bool, moving: Bool) -> dict[str, float | None]:
-    """Return the share of the mask among all, moving and static points."""
-    parts = {"all": mask, "moving": mask[moving], "static": mask[~moving]}
-    return {name: mean_of(part) for name, part in parts.items()}
 
 
 def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:

@@ -212,6 +212,12 @@ def scores_by_motion(
     }
 
 
+def shares_by_motion(mask: Bool, moving: Bool) -> dict[str, float | None]:
+    """Return the share of a mask (N,) among ``all``, ``moving`` and ``static`` rows, else None."""
+    parts = {"all": mask, "moving": mask[moving], "static": mask[~moving]}
+    return {name: mean_of(part) for name, part in parts.items()}
+
+
 def outlier_probability(confidence: Float | Float32) -> Float:
     """Return the probability, in the shape of ``confidence``, of an outlier by KITTI's rule.
 
