@@ -17,7 +17,6 @@ from densify.depth.fill import (
     DIRECTIONS,
     accept_boundary_pixels,
     fill,
-    fill_between,
     fill_stars,
     measure_spots,
     votes_for,
@@ -140,8 +139,10 @@ def made(stage, record, *arguments):
 
 
 def filled_between(depth_m, reach_px):
-    """The map filled by windows of one largest size."""
-    return made(fill_between, record_of(depth_m, spacing_px=reach_px), 1.0)
+    """The map filled by windows of one largest size, without votes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, "_reject_unconfirmed", lambda *_: None)
+        return made(fill, record_of(depth_m, spacing_px=reach_px), 1.0)
 
 
 def test_fill_of_a_plane_is_exact_and_keeps_what_was_measured():

@@ -283,13 +283,6 @@ def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
     record.filled_m[:] = record.depth_m
 
 
-def fill(record: MapRecord, reach: float) -> None:
-    """Fill pixels as `fill_between`; reject those with less than nine tenths of the votes."""
-    empty = record.filled_m == 0
-    fill_between(record, reach)
-    _reject_unconfirmed(record, empty, _FILL_SHARE)
-
-
 def _reject_unconfirmed(record: MapRecord, empty: Bool, least_share: float) -> None:
     """Reject filled pixels that were ``empty`` (H,W) and have less than this share of votes."""
     is_new = empty & (record.filled_m > 0)
@@ -316,7 +309,7 @@ class _Known(NamedTuple):
     inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
 
 
-def fill_between(record: MapRecord, reach: float) -> None:
+def fill(record: MapRecord, reach: float) -> None:
     """Interpolate empty pixels of the record that have measured pixels on both sides, in place.
 
     The window around an empty pixel must hold measured pixels to its left, to its right, above and
@@ -326,7 +319,7 @@ def fill_between(record: MapRecord, reach: float) -> None:
 
     The pixel gets the depth of the weighted plane in inverse depth. The half size of the window
     grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
-    is taken.
+    is taken. Pixels with less than nine tenths of the votes are rejected.
     """
     sizes = min(reach, 1.0) * np.arange(1, _NUM_SIZES + 1) / _NUM_SIZES
     reaches = np.append(sizes, reach) if reach > 1 else sizes
@@ -341,6 +334,7 @@ def fill_between(record: MapRecord, reach: float) -> None:
     column = np.nonzero(is_known)[1].astype(np.int32)
     known = _Known(before, num, column, inverse=1 / filled_m[is_known].astype(np.float64))
     _fill.over_rows(filled_m.size, known, record.spacing_px, reaches, filled_m, record.tilt)
+    _reject_unconfirmed(record, ~is_known, _FILL_SHARE)
 
 
 @inlined
@@ -397,7 +391,7 @@ def _spread(known, window, row, column, centre, slope_u, slope_v):  # type: igno
 
 @Kernel
 def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
-    """Fill the empty pixels from ``first`` to ``last`` as in `fill_between`; reaches ascend."""
+    """Fill the empty pixels from ``first`` to ``last`` as in `fill`; reaches ascend."""
     height, width = filled_m.shape
     moments = np.empty(9)
     for p in range(first, last):
