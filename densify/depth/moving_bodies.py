@@ -147,7 +147,15 @@ def _close(
     record: MapRecord, cloud: Cloud, exposure: Exposure, rows: Int, body: MovingBody, front: _Front
 ) -> None:
     """Put a body, with points at ``rows`` of the cloud, into a record cut to the front's box."""
-    surface = _surface(record, rows, front)
+    inside = front.inverse > 0
+    measured_m = np.maximum(record.depth_m, record.boundary_m)
+    on_body = inside & (measured_m > 0) & np.isin(record.point, rows)
+    # Returns from deep inside, such as those from seats, are not on the surface: the test is
+    # measured_m < front + _DEEP_M, times the inverse depth of the front.
+    on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
+    # The surface is the front of the hull, with a smooth offset through the returns.
+    offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
+    surface = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)  # 1/m
     surface_m = (1 / surface).astype(np.float32)
     allowed_m = _AGREES * agree_m(surface_m)
     share = front.closed_share(body, exposure, record.spacing_px)
@@ -167,19 +175,6 @@ def _close(
     measured = source >= 0
     record.depth_m[shown] = np.where(measured, surface_m, 0)[shown]
     record.point[measured] = source[measured]
-
-
-def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
-    """Return the (h,w) inverse depth (1/m) of a body's surface; arguments as in `_close`."""
-    inside = front.inverse > 0
-    measured_m = np.maximum(record.depth_m, record.boundary_m)
-    on_body = inside & (measured_m > 0) & np.isin(record.point, rows)
-    # Returns from deep inside, such as those from seats, are not on the surface: the test is
-    # measured_m < front + _DEEP_M, times the inverse depth of the front.
-    on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
-    # The surface is the front of the hull, with a smooth offset through the returns.
-    offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
-    return np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
 
 
 def _show(

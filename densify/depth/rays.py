@@ -56,7 +56,9 @@ class Rays:
             offset_ns = registered.sweep.offset_ns
             if offset_ns is not None:
                 # From the reference time to the firing time the scanner moves with the lidar.
-                returns = _find_returns(registered.sweep, cloud.row[rows])
+                row = registered.sweep.row
+                order = np.argsort(row, kind="stable")
+                returns = order[np.searchsorted(row, cloud.row[rows], sorter=order)]
                 twists = registered.twist_before, registered.twist_after
                 origin = move_with_twists(origin, offset_ns[returns] * 1e-9, *twists)
             origins[rows] = poses.transform(self.stretch.T_target_source(self.key, frame), origin)
@@ -78,12 +80,6 @@ def _scanner_origins(sweep: Sweep) -> Float:
     """Return the (S,3) origins of a sweep's scanners in its lidar frame."""
     num_scanners = int(sweep.lidar.max(initial=0)) + 1
     return np.stack([sweep.origin_m(scanner) for scanner in range(num_scanners)])
-
-
-def _find_returns(sweep: Sweep, numbers: Int) -> Int:
-    """Return the (K,) indices in a sweep of the returns with these numbers in the recording."""
-    order = np.argsort(sweep.row, kind="stable")
-    return order[np.searchsorted(sweep.row, numbers, sorter=order)]
 
 
 def half_spaces(corners: Float) -> Float:
@@ -330,10 +326,9 @@ def _complete_box(track: ObjectTrack, rays: ObjectRays, key: int) -> ObjectTrack
             _distance_to_free_space_m(track.size_m, missing_m, axis, sign, start, to_return)
             for sign in (-1, 1)
         ]
-        is_seen = [end_m <= _BESIDE_M for end_m in free_m]
-        sides_seen += [side for side, seen in zip(sides, is_seen, strict=True) if seen]
         # A seen side stays where it is. Free space limits the growth of the other.
-        room_m = [0.0 if seen else end_m for seen, end_m in zip(is_seen, free_m, strict=True)]
+        room_m = [end_m if end_m > _BESIDE_M else 0.0 for end_m in free_m]
+        sides_seen += [side for side, end_m in zip(sides, room_m, strict=True) if not end_m]
         if missing_m[axis] > 0 and sum(room_m):
             growth_m = _share_growth(float(missing_m[axis]), room_m)
             completed = grow_box(completed, axis, *growth_m)
