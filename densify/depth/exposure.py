@@ -188,9 +188,23 @@ class Exposure:
         exposure = _exposure(sequence, stretch, key, key, shot, settings)
         if not settings.output.optical_flow or shot.number is None:
             return exposure
-        return replace(
-            exposure, neighbours=_neighbour_exposures(sequence, stretch, key, shot, settings)
-        )
+        neighbours: dict[str, Exposure] = {}
+        images = list(sequence.image_stamps_ns(shot.camera.name).items())
+        index = next(i for i, (number, _) in enumerate(images) if number == shot.number)
+        sweeps_ns = np.array([registered.sweep.stamp_ns for registered in stretch.sweeps])
+        for name, neighbour_index in (("previous", index - 1), ("next", index + 1)):
+            if not 0 <= neighbour_index < len(images):
+                continue
+            number, exposed_ns = images[neighbour_index]
+            frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
+            begin_ns, end_ns = _own_time_ns(sequence, frame)
+            # An image nearer to a sweep outside the window is too far for the pose of one inside.
+            if begin_ns < exposed_ns <= end_ns:
+                at_sweep = settings.project.at == "sweep"
+                shown_ns = stretch[frame].sweep.stamp_ns if at_sweep else exposed_ns
+                neighbour = Shot(shot.camera, number, shown_ns)
+                neighbours[name] = _exposure(sequence, stretch, key, frame, neighbour, settings)
+        return replace(exposure, neighbours=neighbours)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
         """Project points to the image.
@@ -241,29 +255,6 @@ class Exposure:
     def depth_m(self, points_cam: Float) -> Float:
         """Return the (N,) depth of points (N,3), camera frame: z or range, by ``measure``."""
         return depth_along(points_cam, self.measure)
-
-
-def _neighbour_exposures(
-    sequence: LidarSequence, stretch: Stretch, key: int, shot: Shot, settings: Config
-) -> dict[str, Exposure]:
-    """Return the exposures of a shot's "previous" and "next" image, if the window has them."""
-    neighbours: dict[str, Exposure] = {}
-    images = list(sequence.image_stamps_ns(shot.camera.name).items())
-    index = next(i for i, (number, _) in enumerate(images) if number == shot.number)
-    sweeps_ns = np.array([registered.sweep.stamp_ns for registered in stretch.sweeps])
-    for name, neighbour_index in (("previous", index - 1), ("next", index + 1)):
-        if not 0 <= neighbour_index < len(images):
-            continue
-        number, exposed_ns = images[neighbour_index]
-        frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
-        begin_ns, end_ns = _own_time_ns(sequence, frame)
-        # An image nearer to a sweep outside the window is too far for the pose of one inside.
-        if begin_ns < exposed_ns <= end_ns:
-            at_sweep = settings.project.at == "sweep"
-            shown_ns = stretch[frame].sweep.stamp_ns if at_sweep else exposed_ns
-            neighbour = Shot(shot.camera, number, shown_ns)
-            neighbours[name] = _exposure(sequence, stretch, key, frame, neighbour, settings)
-    return neighbours
 
 
 def _exposure(
