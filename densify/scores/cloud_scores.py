@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud
-from densify.scores.depth_metrics import mean_of, shares_by_motion
+from densify.scores.depth_metrics import mean_or_none, shares_by_motion
 
 _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 
@@ -35,7 +35,7 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
     """Return the share of `ghosts` among the window's points of other sweeps, None without any."""
-    return mean_of(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
+    return mean_or_none(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
 
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:

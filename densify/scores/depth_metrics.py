@@ -84,17 +84,17 @@ def depth_errors(
         num_pixels=num_pixels,
         num_compared=num_compared,
         coverage=num_compared / num_pixels if num_pixels else None,
-        mae_m=mean_of(error_m),
+        mae_m=mean_or_none(error_m),
         rmse_m=_root_mean_square(error_m),
-        imae_per_km=mean_of(error_per_km),
+        imae_per_km=mean_or_none(error_per_km),
         irmse_per_km=_root_mean_square(error_per_km),
-        abs_rel=mean_of(error_m / t),
-        sq_rel=mean_of((error_m / t) ** 2),
-        delta_1=mean_of(ratio < _DELTA),
-        delta_2=mean_of(ratio < _DELTA**2),
-        delta_3=mean_of(ratio < _DELTA**3),
-        outliers=mean_of(is_outlier_depth(z, t, focal_px, baseline_m)),
-        outliers_1_px=mean_of(focal_px * baseline_m * np.abs(1 / z - 1 / t) > 1),
+        abs_rel=mean_or_none(error_m / t),
+        sq_rel=mean_or_none((error_m / t) ** 2),
+        delta_1=mean_or_none(ratio < _DELTA),
+        delta_2=mean_or_none(ratio < _DELTA**2),
+        delta_3=mean_or_none(ratio < _DELTA**3),
+        outliers=mean_or_none(is_outlier_depth(z, t, focal_px, baseline_m)),
+        outliers_1_px=mean_or_none(focal_px * baseline_m * np.abs(1 / z - 1 / t) > 1),
         silog=float(np.std(np.log(z / t))) if num_compared else None,
     )
 
@@ -119,7 +119,7 @@ def precision_density(
             point[f"density_{name}"] = image_density(predicted_m)
             point[f"outliers_{name}"] = errors.outliers
             kept_confidence = maps.confidence[predicted_m > 0]
-            point[f"expected_{name}"] = mean_of(outlier_probability(kept_confidence))
+            point[f"expected_{name}"] = mean_or_none(outlier_probability(kept_confidence))
         curve.append(point)
     return curve
 
@@ -179,7 +179,7 @@ def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
     for field in fields(DepthErrors):
         values = [value for image in images if (value := getattr(image, field.name)) is not None]
         counted = field.name.startswith("num_")
-        means[field.name] = sum(values) if counted else mean_of(np.array(values))
+        means[field.name] = sum(values) if counted else mean_or_none(np.array(values))
     return DepthErrors(**means)
 
 
@@ -215,7 +215,7 @@ def scores_by_motion(
 def shares_by_motion(mask: Bool, moving: Bool) -> dict[str, float | None]:
     """Return the share of a mask (N,) among ``all``, ``moving`` and ``static`` rows, else None."""
     parts = {"all": mask, "moving": mask[moving], "static": mask[~moving]}
-    return {name: mean_of(part) for name, part in parts.items()}
+    return {name: mean_or_none(part) for name, part in parts.items()}
 
 
 def outlier_probability(confidence: Float | Float32) -> Float:
@@ -245,7 +245,7 @@ def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
     return (error_px > OUTLIER_PX) & (error_px > OUTLIER_FRACTION * true_px)
 
 
-def mean_of(values: np.ndarray) -> float | None:
+def mean_or_none(values: np.ndarray) -> float | None:
     """Return the mean, None for no values."""
     return float(np.mean(values)) if len(values) else None
 
