@@ -7,10 +7,10 @@ import numpy as np
 
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, PointsInImage
+from densify.depth.fill import to_lab
 from densify.depth.measured_pixels import ALL_ROUND, MapInputs, MapRecord
 from densify.depth.patches import find_patches
 from densify.depth.project import project
-from densify.depth.votes import to_lab
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import Camera, Cloud, RegisteredSweep, Sweep
 
@@ -63,7 +63,7 @@ def make_camera(width=64, height=48, focal=60.0, distortion=()) -> Camera:
 def make_cloud(points, frame=KEY, confidence=1.0) -> Cloud:
     points = np.asarray(points, float).reshape(-1, 3)
     n = len(points)
-    frame = np.broadcast_to(np.asarray(frame, np.int32), n).copy()
+    frame = np.full(n, frame, np.int32)
     return Cloud(
         points=points,
         rigid_points=points,
@@ -74,7 +74,7 @@ def make_cloud(points, frame=KEY, confidence=1.0) -> Cloud:
         moving=np.zeros(n, bool),
         instance=np.full(n, -1, np.int32),
         velocity_m_s=np.zeros((n, 3), np.float32),
-        confidence=np.broadcast_to(np.asarray(confidence, np.float32), n).copy(),
+        confidence=np.full(n, confidence, np.float32),
         intensity=np.zeros(n, np.float32),
         rgb=np.zeros((n, 3), np.uint8),
         far=np.zeros(n, bool),
@@ -82,20 +82,16 @@ def make_cloud(points, frame=KEY, confidence=1.0) -> Cloud:
 
 
 def patches_of(cloud, origins=None):
-    """Patches of a cloud whose own points tell how its scanners sample directions.
+    """Patches of one scanner's cloud, whose own points tell how it samples directions.
 
-    origins: (S,3) of the scanners by frame; one scanner in the key frame's origin without it.
+    origins: (1,3) of the scanner by frame; the key frame's origin without it.
     """
     frames = np.unique(cloud.frame).tolist()
     origins = origins or dict.fromkeys(frames, np.zeros((1, 3)))
-    sweeps = []
-    for frame in frames:
-        returns = cloud.select(cloud.frame == frame)
-        sweep = Sweep(
-            *(frame, 0, returns.points - origins[frame][0], returns.intensity, None),
-            *(returns.lidar, returns.row, origins[frame] - origins[frame][0]),
-        )
-        sweeps.append(RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6)))
+    sweeps = [
+        registered(f, cloud.points[cloud.frame == f] - origins[f][0], np.eye(4), np.zeros(6))
+        for f in frames
+    ]
     return find_patches(cloud, Sensors.of(sweeps), origins)
 
 
@@ -116,6 +112,19 @@ def at_pixel(camera, u, v, z):
     x = (u - camera.K[0, 2]) / camera.K[0, 0] * z
     y = (v - camera.K[1, 2]) / camera.K[1, 1] * z
     return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+
+def pixel_rays(camera) -> np.ndarray:
+    """(H,W,3) rays of a camera's pixels, one metre forwards (x) in the lidar's axes."""
+    v, u = np.mgrid[: camera.height_px, : camera.width_px]
+    left, up = (camera.K[0, 2] - u) / camera.K[0, 0], (camera.K[1, 2] - v) / camera.K[1, 1]
+    return np.stack([np.ones(u.shape), left, up], axis=-1)
+
+
+def scanner_rays(azimuth_deg, elevation_deg) -> np.ndarray:
+    """(N,3) rays of a scanner, one metre forwards (x)."""
+    a, e = (g.ravel() for g in np.deg2rad(np.meshgrid(azimuth_deg, elevation_deg)))
+    return np.stack([np.ones_like(a), np.tan(a), np.tan(e) / np.cos(a)], axis=1)
 
 
 def registered(frame, points, pose, twist, offset_ns=None) -> RegisteredSweep:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from densify.geometry.types import Camera, DepthMap
+from densify.geometry.types import DepthMap
 from densify.scores.depth_metrics import (
     DepthErrors,
     depth_edges,
@@ -20,6 +20,7 @@ from densify.scores.depth_metrics import (
     depth_scores,
     mean_errors,
 )
+from tests.depth_scenes import make_camera
 
 
 def image(values):
@@ -35,9 +36,8 @@ def test_kittis_baseline_is_the_default():
 def test_depth_scores_split_measured_filled_moving_static():
     truth, moving = image([10.0] * 4), np.array([[True, True, False, False]])
     measured_m, filled_m = image([12.0, 0, 10.0, 0]), image([12.0, 14.0, 10.0, 0])
-    frame = np.where(measured_m > 0, 7, -1).astype(np.int32)
-    depth = DepthMap("cam", measured_m, filled_m, image([1, 0.5, 1, 0]), frame)
-    camera = Camera("cam", 4, 1, np.diag([700.0, 700, 1]), np.eye(4))
+    depth = DepthMap("cam", measured_m, filled_m, image([1, 0.5, 1, 0]), np.zeros((1, 4), np.int32))
+    camera = make_camera(4, 1, 700.0)
     scores = depth_scores(depth, truth, moving, camera)
     assert json.loads(json.dumps(scores, allow_nan=False)) == scores
     mae_m = {

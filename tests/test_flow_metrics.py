@@ -12,7 +12,6 @@ from densify.readers.flow_files import CATEGORIES
 from densify.scores import flow_metrics as metrics
 from densify.scores.flow_metrics import CLASSES, IGNORED, challenge_scores
 
-NOTHING = np.zeros((0, 3))
 NAMES = ("NONE", *CATEGORIES)
 BUCKETED = {
     "BACKGROUND": (0.06863006888603677, math.nan),
@@ -61,19 +60,6 @@ def test_the_numbers_of_the_challenges_own_package():
     assert three_way == pytest.approx((*THREE_WAY, sum(THREE_WAY) / 3), rel=1e-6)
 
 
-def test_the_challenge_scores_nothing_beyond_its_range():
-    scores = challenge_scores(
-        np.array([[35.0, 0, 0]]), np.zeros((1, 3)), np.ones((1, 3)), np.array([1])
-    )
-    assert scores["num_points"] == 0 and list(scores["bucketed"]) == ["MEAN"]
-    for values in (scores["three_way"], scores["bucketed"]["MEAN"]):
-        assert all(map(math.isnan, values.values()))
-
-
-def along_x(*lengths: float) -> np.ndarray:
-    return np.array([[x, 0.0, 0.0] for x in lengths])
-
-
 def test_end_point_error_by_hand():
     flow, true = np.array([[3.0, 4, 0], [1, 1, 1], [0, 0, 2]]), np.array([[0.0, 0, 0]] * 3)
     assert metrics.end_point_errors(flow, true).tolist() == pytest.approx([5, math.sqrt(3), 2])
@@ -104,10 +90,15 @@ def test_angles_by_hand():
 
 
 def test_nothing_gives_nan():
+    none, one, nothing = np.zeros((1, 3)), np.ones((1, 3)), np.zeros((0, 3))
+    beyond = challenge_scores(np.array([[35.0, 0, 0]]), none, one, np.array([1]))
+    assert beyond["num_points"] == 0 and list(beyond["bucketed"]) == ["MEAN"]
     values = [
-        metrics.end_point_error(NOTHING, NOTHING),
-        metrics.end_point_error(along_x(1), along_x(1), np.array([False])),
-        metrics.accuracy(NOTHING, NOTHING, metrics.STRICT),
-        metrics.angle_error_rad(along_x(1), along_x(0)),
+        metrics.end_point_error(nothing, nothing),
+        metrics.end_point_error(one, one, np.array([False])),
+        metrics.accuracy(nothing, nothing, metrics.STRICT),
+        metrics.angle_error_rad(one, none),
+        *beyond["three_way"].values(),
+        *beyond["bucketed"]["MEAN"].values(),
     ]
-    assert all(math.isnan(v) for v in values), values
+    assert all(map(math.isnan, values)), values

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from densify.depth import moving_bodies as stage
 from densify.depth import rays as hulls
 from densify.depth.exposure import Exposure
 from densify.depth.rays import Rays, find_moving_bodies, without_sweep
-from densify.geometry.types import Stretch
+from densify.geometry.types import Cloud, Stretch
 from tests.depth_scenes import (
     KEY,
     T_CAM_LIDAR,
@@ -21,7 +22,9 @@ from tests.depth_scenes import (
     make_camera,
     make_cloud,
     patches_of,
+    pixel_rays,
     registered,
+    scanner_rays,
 )
 
 CAMERA = make_camera(width=420, height=160, focal=400.0)
@@ -53,10 +56,7 @@ def scanned(dark, passes):
     parts, sweeps = [], []
     for frame in range(KEY - 5, KEY + 6):
         moved = np.array([0, STEP_M * (frame - KEY), 0])
-        azimuth = np.deg2rad(np.arange(-29, 29, 0.2) + rng.uniform(0, 0.2))
-        elevation = np.deg2rad(np.arange(-11, 11, 0.4))
-        a, e = (g.ravel() for g in np.meshgrid(azimuth, elevation))
-        ray = np.stack([np.ones_like(a), np.tan(a), np.tan(e) / np.cos(a)], axis=1)
+        ray = scanner_rays(np.arange(-29, 29, 0.2) + rng.uniform(0, 0.2), np.arange(-11, 11, 0.4))
         enter, leave = enters(np.zeros(3), ray, LOW + moved, HIGH + moved)
         meets = enter < leave
         at = ray * np.where(meets, enter, WALL_M)[:, None]
@@ -71,20 +71,16 @@ def scanned(dark, passes):
         cloud.moving[:], cloud.instance[:] = own, np.where(own, 0, -1)
         cloud.velocity_m_s[own] = [0, STEP_M / 0.1, 0]
         parts.append(replace(cloud, points=at - own[:, None] * moved))
-    whole = parts[0]
-    for part in parts[1:]:
-        whole = whole.joined(part)
-    return whole, Rays(Stretch(tuple(sweeps)), KEY)
+    return reduce(Cloud.joined, parts), Rays(Stretch(tuple(sweeps)), KEY)
 
 
 def maps(dark, passes):
     """The map without and with bodies, true depth of the box (0 none), y and z of its front."""
     cloud, rays = scanned(dark, passes)
     surface = patches_of(cloud)
-    v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
-    ray = np.stack([np.ones(u.shape), (CAMERA.K[0, 2] - u) / 400, (CAMERA.K[1, 2] - v) / 400], -1)
+    ray = pixel_rays(CAMERA)
     enter, leave = enters(np.zeros(3), ray.reshape(-1, 3), LOW, HIGH)
-    true_m = np.where(enter < leave, enter, 0).reshape(u.shape)
+    true_m = np.where(enter < leave, enter, 0).reshape(ray.shape[:2])
     before = depth_map(cloud, EXPOSURE, surface, rays=rays)
     bodies = find_moving_bodies(cloud, rays, [EXPOSURE])
     assert bodies.keys() == {0}
@@ -139,23 +135,6 @@ def test_lines_cross_a_hull_where_sampling_finds_them():
             )
         else:
             assert max(enter[i], -3) > min(leave[i], 3) - 2e-3
-
-
-def test_a_smooth_offset_is_the_least_of_its_sum():
-    rng = np.random.default_rng(5)
-    inside = rng.random((9, 11)) < 0.8
-    known = inside & (rng.random(inside.shape) < 0.3)
-    offset = np.where(known, rng.normal(size=inside.shape), 0)
-
-    def cost(o):
-        across = (np.diff(o, axis=1)[inside[:, 1:] & inside[:, :-1]] ** 2).sum()
-        down = (np.diff(o, axis=0)[inside[1:] & inside[:-1]] ** 2).sum()
-        small = stage._TOWARDS_HULL * (o[inside] ** 2).sum()
-        return ((o - offset)[known] ** 2).sum() + stage._SMOOTHNESS * (across + down) + small
-
-    smooth = stage._smooth(offset, known, inside)
-    for _ in range(50):
-        assert cost(smooth + np.where(inside, rng.normal(0, 0.01, inside.shape), 0)) > cost(smooth)
 
 
 def test_a_body_is_in_view_has_a_front_and_loses_the_rays_of_a_sweep():

@@ -10,17 +10,14 @@ import numpy as np
 import pytest
 
 from densify.free_space.range_image import RangeImage
-from densify.geometry.types import Cloud, RegisteredSweep, Sweep
+from densify.geometry.types import Cloud
 from densify.scores.cloud_scores import ghost_rate, ghost_scores
+from tests.depth_scenes import KEY, make_cloud, registered
 
-KEY = 7
 
-
-def sweep_of(points: np.ndarray, frame: int = KEY) -> RegisteredSweep:
-    n, stamp_ns = len(points), (frame - KEY) * 100_000_000
-    lidar, row, intensity = np.zeros(n, np.uint8), np.arange(n), np.zeros(n, np.float32)
-    sweep = Sweep(frame, stamp_ns, points, intensity, None, lidar, row)
-    return RegisteredSweep(sweep, np.eye(4), np.zeros(6), np.zeros(6))
+def image_of(points: np.ndarray) -> RangeImage:
+    """The range image of the key sweep."""
+    return RangeImage.of(registered(KEY, points, np.eye(4), np.zeros(6)))
 
 
 def room(range_m: float = 20.0) -> np.ndarray:
@@ -38,16 +35,10 @@ def panel(distance_m: float) -> np.ndarray:
 
 def cloud_of(*parts: tuple[np.ndarray, int, bool]) -> Cloud:
     """parts: (points, frame, moving)."""
-    points = np.concatenate([points for points, _, _ in parts])
-    frame, moving = (
-        np.concatenate([np.full(len(part[0]), part[column]) for part in parts]) for column in (1, 2)
-    )
-    n, since_key_ns = len(points), (frame - KEY) * 100_000_000
-    row, lidar, none = np.arange(n), np.zeros(n, np.uint8), np.full(n, -1, np.int32)
-    ones, zeros = np.ones(n, np.float32), np.zeros((n, 3), np.float32)
-    colour, far = np.zeros((n, 3), np.uint8), np.zeros(n, bool)
-    key_time = (frame.astype(np.int32), since_key_ns, row, lidar, moving, none, zeros)
-    return Cloud(points, points, *key_time, ones, ones, colour, far)
+    points, frames, moving = zip(*parts, strict=True)
+    sizes = [len(part) for part in points]
+    cloud = make_cloud(np.concatenate(points), np.repeat(frames, sizes))
+    return replace(cloud, moving=np.repeat(moving, sizes))
 
 
 def test_ghosts_need_the_margin():
@@ -58,12 +49,12 @@ def test_ghosts_need_the_margin():
         (100, 98.5, 0),  # 2 % of 100 m counts beyond half a metre
         (100, 97.0, 1),
     ):
-        image = RangeImage.of(sweep_of(room(range_m)))
+        image = image_of(room(range_m))
         assert ghost_rate(cloud_of((panel(distance_m), KEY + 1, False)), image, KEY) == rate
 
 
 def test_the_key_sweep_itself_and_an_unseen_direction_hold_no_ghosts():
-    image = RangeImage.of(sweep_of(room()))
+    image = image_of(room())
     assert ghost_rate(cloud_of((room(), KEY + 1, False)), image, KEY) == 0
     above = panel(1.0)[:, [1, 2, 0]] * [0.1, 0.1, 5.0]
     scores = ghost_scores(cloud_of((above, KEY + 1, False)), image, KEY)
@@ -72,7 +63,7 @@ def test_the_key_sweep_itself_and_an_unseen_direction_hold_no_ghosts():
 
 
 def test_ghost_scores_by_kind_and_distance_without_what_lies_beyond_the_window():
-    image, n = RangeImage.of(sweep_of(room())), len(room())
+    image, n = image_of(room()), len(room())
     cloud = cloud_of(
         (panel(10.0), KEY - 2, True),
         (panel(20.5), KEY + 2, True),

@@ -18,7 +18,9 @@ from tests.depth_scenes import (
     make_camera,
     make_cloud,
     patches_of,
+    pixel_rays,
     registered,
+    scanner_rays,
 )
 
 FRONT_M, WALL_M = 12.0, 20.0
@@ -41,10 +43,7 @@ def scanned(solid):
     points, frames, origins, sweeps = [], [], {}, []
     for frame in range(KEY - 5, KEY + 6):
         origin = np.array([0.7 * (frame - KEY), 0.15 * (frame - KEY), 0.0])
-        azimuth = np.deg2rad(np.arange(-25, 25, 0.17) + rng.uniform(0, 0.17))
-        elevation = np.deg2rad(np.arange(-4, 4, 0.4))
-        a, e = (g.ravel() for g in np.meshgrid(azimuth, elevation))
-        ray = np.stack([np.ones_like(a), np.tan(a), np.tan(e) / np.cos(a)], axis=1)
+        ray = scanner_rays(np.arange(-25, 25, 0.17) + rng.uniform(0, 0.17), np.arange(-4, 4, 0.4))
         at = origin + ray * (FRONT_M - origin[0])
         stops = solid(at[:, 1], at[:, 2])
         at[~stops] = (origin + ray * (WALL_M - origin[0]))[~stops]
@@ -63,9 +62,7 @@ def maps(solid, **knobs):
     cloud, origins, rays = scanned(solid)
     exposure = Exposure(CAMERA, T_CAM_LIDAR, **knobs)
     surface = patches_of(cloud, origins)
-    v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
-    y = -(u - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * FRONT_M
-    z = -(v - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * FRONT_M
+    _, y, z = np.moveaxis(pixel_rays(CAMERA) * FRONT_M, -1, 0)
     before = depth_map(cloud, exposure, surface)
     return before, depth_map(cloud, exposure, surface, rays=rays), solid(y, z)
 
@@ -79,8 +76,7 @@ def test_gaps_of_a_fence_are_not_closed():
     assert closed[1] < 0.35 * closed[0]
     assert pickets[1] > 0.7 * pickets[0]
     dropped = (before.filled_m > 0) & (after.filled_m == 0)
-    kept = ~dropped
-    assert np.array_equal(after.filled_m[kept], before.filled_m[kept])
+    assert np.array_equal(after.filled_m[~dropped], before.filled_m[~dropped])
     assert not after.depth_m[dropped].any()
     assert np.array_equal(after.rejected.depth_m[dropped], before.filled_m[dropped])
     assert np.array_equal(after.frame >= 0, after.depth_m > 0)
@@ -97,16 +93,12 @@ def test_a_pole_stays_though_sweeps_saw_what_is_behind_it():
 @pytest.mark.parametrize("measure", ["z", "range"])
 def test_rays_cross_a_surface_where_geometry_says(measure):
     rng = np.random.default_rng(1)
-    start = np.column_stack([rng.uniform(-3, 3, (120, 3))]) * [1, 1, 0.2]
-    end = np.column_stack(
-        [rng.uniform(15, 25, 120), rng.uniform(-6, 6, 120), rng.uniform(-1, 1, 120)]
-    )
+    start = rng.uniform(-3, 3, (120, 3)) * [1, 1, 0.2]
+    end = rng.uniform([15, -6, -1], [25, 6, 1], (120, 3))
     exposure = Exposure(CAMERA, T_CAM_LIDAR, measure=measure)
-    v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px]
-    ray = np.stack([np.ones(u.shape), (CAMERA.K[0, 2] - u) / 720, (CAMERA.K[1, 2] - v) / 720], -1)
-    plane_m = FRONT_M if measure == "z" else FRONT_M * np.linalg.norm(ray, axis=-1)
-    surface_m = np.broadcast_to(plane_m, u.shape).astype(np.float32)
-    surface_m = np.where(u > 300, 0, surface_m).astype(np.float32)
+    ray = pixel_rays(CAMERA)
+    depth_m = FRONT_M * (ray[..., 0] if measure == "z" else np.linalg.norm(ray, axis=-1))
+    surface_m = np.where(np.arange(CAMERA.width_px) > 300, 0, depth_m).astype(np.float32)
     share = (FRONT_M - start[:, :1]) / (end[:, :1] - start[:, :1])
     at, num_known, num_found = start + share * (end - start), 0, 0
     for i in range(len(start)):

@@ -125,23 +125,22 @@ def test_maps_between_two_sweeps_are_the_streets():
         np.testing.assert_allclose(maps.age_s[both], since_s, atol=1e-6)
 
 
+AHEAD = poses.exp(np.array([0, 0, 0, 0.5, 0, 0]))
+
+
 class PosedImages(TinySequence):
     """Whose images were taken 0.5 m ahead of where the vehicle is."""
 
     def T_world_cam(self, camera, number):
         T_world_lidar = self.scene.T_world_lidar(number * SWEEP_S + self.late_s)
-        ahead = np.eye(4)
-        ahead[0, 3] = 0.5
-        return T_world_lidar @ ahead @ poses.inverse(CAMERA.T_cam_lidar)
+        return T_world_lidar @ AHEAD @ poses.inverse(CAMERA.T_cam_lidar)
 
 
 def test_the_data_sets_own_pose_of_an_image_is_taken():
     plain = one_car(late_s=0.02)
     sequence = PosedImages(plain.scene, plain.frames, 0.02)
     found = run(sequence, KEY, 1, "icp", config=POSES_GIVEN).depth["front"].depth_m
-    back = np.eye(4)
-    back[0, 3] = -0.5
-    moved = replace(CAMERA, T_cam_lidar=CAMERA.T_cam_lidar @ back)
+    moved = replace(CAMERA, T_cam_lidar=CAMERA.T_cam_lidar @ poses.inverse(AHEAD))
     other = TinySequence(plain.scene, plain.frames, 0.02, cameras=(moved,))
     expected = run(other, KEY, 1, "icp", config=POSES_GIVEN).depth["front"].depth_m
     both = (found > 0) & (expected > 0)
@@ -176,10 +175,7 @@ def seen_row_by_row(exposure, point, velocity):
     low, high = 0.0, 2 * middle
     for _ in range(40):
         v = (low + high) / 2
-        if off(v)[0][axis] > v:
-            low = v
-        else:
-            high = v
+        low, high = (v, high) if off(v)[0][axis] > v else (low, v)
     return off((low + high) / 2)
 
 
@@ -190,9 +186,7 @@ def test_points_are_seen_when_their_row_or_column_is_exposed(axis, time_s):
     assert camera.is_rolling and camera.readout_s == pytest.approx(size * 1e-4)
     exposure = Exposure(camera, CAMERA.T_cam_lidar, late_s=0.02, twist=TWIST)
     rng = np.random.default_rng(1)
-    points = np.column_stack(
-        [rng.uniform(6, 40, 200), rng.uniform(-9, 9, 200), rng.uniform(-2, 3, 200)]
-    )
+    points = rng.uniform([6, -9, -2], [40, 9, 3], (200, 3))
     velocity = rng.normal(0, 6, (200, 3))
     sight = exposure.see(points, velocity)
     assert sight.inside.sum() > 80
@@ -209,15 +203,12 @@ def test_points_are_seen_when_their_row_or_column_is_exposed(axis, time_s):
     np.testing.assert_allclose(sight.uv[middle], still.uv[middle], atol=0.5)
 
 
-STREET_KEY = 60
-
-
 def test_a_fisheye_of_190_degrees_measures_the_street():
-    street = Street.from_spec("street:static?cameras=fisheye&sensor=hdl32")
+    street, key = Street.from_spec("street:static?cameras=fisheye&sensor=hdl32"), 60
     method = "icp-visible"
-    result = compare(street, STREET_KEY, 1, None, POSES_GIVEN, methods=(method,))[method]
+    result = compare(street, key, 1, None, POSES_GIVEN, methods=(method,))[method]
     maps = result.depth["fisheye"]
-    near = key_shots(street, [street.cameras["fisheye"]], STREET_KEY, SWEEP)["fisheye"]
+    near = key_shots(street, [street.cameras["fisheye"]], key, SWEEP)["fisheye"]
     true_m = street.truth.depth_m("fisheye", near.number)
     known = (maps.depth_m > 0) & (true_m > 0)
     off_m = np.abs(maps.depth_m - true_m)[known]

@@ -54,13 +54,9 @@ def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
     Shares, steps and ages enter by their logarithm to base 10, because probabilities of errors are
     proportional to powers of them. The step is the logarithm of the ratio of the greatest to the
     least depth around, as a multiple of the tolerance of KITTI's rule. Age and discontinuity are
-    those of the nearest measured pixel. A moving body has no discontinuity. Spacings are those of
-    neighbouring rays.
-
-    Args:
-        record: The map, before `densify.depth.fill.measure_spots`.
-        since_key_ns: (M,) ns from the key sweep of the points of the cloud.
-        camera: Camera of the map.
+    those of the nearest measured pixel, before `densify.depth.fill.measure_spots`. A moving body
+    has no discontinuity. Spacings are those of neighbouring rays. ``since_key_ns`` (M,) are the
+    times of the cloud's points since the key sweep.
     """
     shown, rejected = record.filled_m > 0, record.rejected_m > 0
     has_depth = shown | rejected
@@ -136,10 +132,8 @@ def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
     """
     own_m = np.where(depth_m > 0, depth_m, np.inf)
     least_m = np.minimum(np.where(filled_m > 0, filled_m, np.inf), own_m).astype(np.float32)
-    nearest_m = np.minimum(ndimage.minimum_filter(least_m, size_px), least_m)
-    farthest_m = np.maximum(
-        ndimage.maximum_filter(filled_m, size_px), np.maximum(depth_m, filled_m)
-    )
+    nearest_m = ndimage.minimum_filter(least_m, size_px)
+    farthest_m = np.maximum(ndimage.maximum_filter(filled_m, size_px), depth_m)
     step = np.zeros_like(depth_m)
     np.log(farthest_m / nearest_m, out=step, where=depth_m > 0)
     return step
@@ -161,12 +155,10 @@ def confidence_by_age(since_key_ns: Int) -> Float32:
 def choose_most_certain(
     confidence: Float32, max_outliers: float, before: Float32 | None = None
 ) -> Bool:
-    """Return (P,) True at the most certain pixels, as many as keep the expected outliers low.
+    """Return (P,) True at the most certain of pixels with confidences (P,).
 
-    Args:
-        confidence: (P,) confidences of the pixels to choose from.
-        max_outliers: Greatest expected share of outliers, of the chosen pixels and those before.
-        before: Confidences of pixels that are chosen already; None for none.
+    As many are chosen as keep the expected share of outliers of the chosen pixels, and of those
+    with the confidences ``before`` that are chosen already, at most ``max_outliers``.
     """
     before_probability = outlier_probability(np.zeros(0) if before is None else before)
     best_first = np.argsort(-confidence, kind="stable")
@@ -184,12 +176,8 @@ def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthM
     """Return the map with as many pixels as possible at this expected share of outliers.
 
     If the map expects fewer outliers, the most certain of its rejected pixels are given back. If it
-    expects more, its least certain pixels are left out. A map without calibrated confidence stays.
-
-    Args:
-        depth_map: A map with its ``rejected`` pixels.
-        max_outliers: Greatest expected share of outliers of the filled map; None leaves its pixels
-            as they are.
+    expects more, its least certain pixels are left out. With None, or without calibrated
+    confidence, it keeps its pixels.
     """
     rejected = depth_map.rejected
     if rejected is None or max_outliers is None:
@@ -221,16 +209,11 @@ def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthM
 def without_times(
     depth_map: DepthMap, smear_m: float, camera: Camera, share: float = 1.0
 ) -> DepthMap:
-    """Return the map with lower confidence at near pixels, for sweeps without times of points.
+    """Return the map with lower confidence at near pixels, if a ``share`` of sweeps has no times.
 
     The vehicle's motion within such a sweep moves depths by an unknown amount up to ``smear_m`` in
-    either direction. Near pixels tolerate less of it than far pixels.
-
-    Args:
-        depth_map: The map.
-        smear_m: Half the travel in metres along the camera's axis from sweep to sweep.
-        camera: Camera of the map.
-        share: Share of the sweeps without times.
+    either direction: half the travel along the camera's axis from sweep to sweep. Near pixels
+    tolerate less of it than far pixels.
     """
 
     def outlier_or_smeared(probability: Float, depth_m: Float32) -> Float:
@@ -275,15 +258,10 @@ def expected_outliers(depth_map: DepthMap) -> dict[str, float | None]:
 
 
 def reliability(depth_map: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
-    """Return expected and true outliers by confidence, over the filled pixels with ground truth.
+    """Return expected and true outliers by confidence, over filled pixels with a depth ``truth_m``.
 
     Each interval of 0.05 with pixels has ``confidence`` (its start), ``num_compared`` pixels, and
     the ``expected`` and the true share of ``outliers``.
-
-    Args:
-        depth_map: The map.
-        truth_m: (H,W) true depth in metres, 0 none.
-        camera: Camera of the map.
     """
     compared = (truth_m > 0) & (depth_map.filled_m > 0)
     confidence = depth_map.confidence[compared]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -60,13 +61,7 @@ def key_shots(
     By default each camera has one map, with its name. It shows the image exposed nearest to the key
     sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
     image nearer to the key sweep than to any other. Without an image within about half a period the
-    default map shows the time of the sweep.
-
-    Args:
-        sequence: The recording.
-        cameras: Cameras that get maps.
-        key: Frame number of the key sweep.
-        settings: ``per`` and ``at`` choose the maps and their times.
+    default map shows the time of the sweep. ``key`` is the frame number of the key sweep.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -89,11 +84,11 @@ def key_shots(
                     (end_ns - begin_ns) / 2e6,  # half of the interval, in ms
                 )
         elif images_ns:
-            nearest = min(
-                images_ns,
-                key=lambda number: (abs(images_ns[number] - stamp_ns), images_ns[number]),
+            _, exposed_ns, nearest = min(
+                (abs(exposed_ns - stamp_ns), exposed_ns, number)
+                for number, exposed_ns in images_ns.items()
             )
-            shown_ns = images_ns[nearest] if settings.at == "camera" else stamp_ns
+            shown_ns = exposed_ns if settings.at == "camera" else stamp_ns
             shots[camera.name] = Shot(camera, nearest, shown_ns)
         else:
             shots[camera.name] = Shot(camera, None, stamp_ns)
@@ -120,23 +115,17 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
     """
     frames = list(sequence.frames)
     index = frames.index(key)
-    stamps_ns = {}
-    for frame in frames[max(0, index - 1) : index + 2]:
-        try:
-            stamps_ns[frame] = sequence.stamp_ns(frame)
-        except InputError:
-            # A neighbouring sweep may have no readable stamp. Only the key sweep must have one.
-            if frame == key:
-                raise
+    key_ns = sequence.stamp_ns(key)
+    stamps_ns = [key_ns]
+    for frame in (*frames[max(0, index - 1) : index], *frames[index + 1 : index + 2]):
+        with suppress(InputError):  # a neighbouring sweep may have no readable stamp
+            stamps_ns.append(sequence.stamp_ns(frame))
     if len(stamps_ns) < 2:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
-
-    key_ns = stamps_ns[key]
-    ascending_ns = list(stamps_ns.values())
     # A gap in the recording, or the end of it, must not widen the time.
-    max_period_ns = int(_JITTER * np.diff(ascending_ns).min())
-    before_ns = max([key_ns - max_period_ns, *(t_ns for t_ns in ascending_ns if t_ns < key_ns)])
-    after_ns = min([key_ns + max_period_ns, *(t_ns for t_ns in ascending_ns if t_ns > key_ns)])
+    max_period_ns = int(_JITTER * np.diff(sorted(stamps_ns)).min())
+    before_ns = max([key_ns - max_period_ns, *(t_ns for t_ns in stamps_ns if t_ns < key_ns)])
+    after_ns = min([key_ns + max_period_ns, *(t_ns for t_ns in stamps_ns if t_ns > key_ns)])
     return (before_ns + key_ns) // 2, (key_ns + after_ns) // 2
 
 
@@ -195,20 +184,26 @@ class Exposure:
 
         The camera pose is the recorded pose of the image. Without one it is extrapolated from the
         key sweep with the vehicle's twist. ``output.optical_flow`` adds the ``neighbours``.
-
-        Args:
-            sequence: The recording.
-            stretch: Registered sweeps of the window.
-            key: Frame number of the key sweep.
-            shot: What the map shows.
-            settings: Configuration of the run.
         """
         exposure = _exposure(sequence, stretch, key, key, shot, settings)
         if not settings.output.optical_flow or shot.number is None:
             return exposure
-        neighbours = _neighbour_exposures(
-            sequence, stretch, key, shot.camera, shot.number, settings
-        )
+        neighbours: dict[str, Exposure] = {}
+        images = list(sequence.image_stamps_ns(shot.camera.name).items())
+        index = next(i for i, (number, _) in enumerate(images) if number == shot.number)
+        sweeps_ns = np.array([registered.sweep.stamp_ns for registered in stretch.sweeps])
+        for name, neighbour_index in (("previous", index - 1), ("next", index + 1)):
+            if not 0 <= neighbour_index < len(images):
+                continue
+            number, exposed_ns = images[neighbour_index]
+            frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
+            begin_ns, end_ns = _own_time_ns(sequence, frame)
+            # An image nearer to a sweep outside the window is too far for the pose of one inside.
+            if begin_ns < exposed_ns <= end_ns:
+                at_sweep = settings.project.at == "sweep"
+                shown_ns = stretch[frame].sweep.stamp_ns if at_sweep else exposed_ns
+                neighbour = Shot(shot.camera, number, shown_ns)
+                neighbours[name] = _exposure(sequence, stretch, key, frame, neighbour, settings)
         return replace(exposure, neighbours=neighbours)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
@@ -262,43 +257,8 @@ class Exposure:
         return depth_along(points_cam, self.measure)
 
 
-def _neighbour_exposures(
-    sequence: LidarSequence,
-    stretch: Stretch,
-    key: int,
-    camera: Camera,
-    number: int,
-    settings: Config,
-) -> dict[str, Exposure]:
-    """Return the exposures of an image's "previous" and "next" image, if the window has them."""
-    neighbours: dict[str, Exposure] = {}
-    stamps_ns = sequence.image_stamps_ns(camera.name)
-    numbers = list(stamps_ns)
-    index = numbers.index(number)
-    sweeps_ns = np.array([registered.sweep.stamp_ns for registered in stretch.sweeps])
-    for name, neighbour_index in (("previous", index - 1), ("next", index + 1)):
-        if not 0 <= neighbour_index < len(numbers):
-            continue
-        neighbour_number = numbers[neighbour_index]
-        exposed_ns = stamps_ns[neighbour_number]
-        frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
-        begin_ns, end_ns = _own_time_ns(sequence, frame)
-        # An image nearer to a sweep outside the window is too far for the pose of one inside.
-        if begin_ns < exposed_ns <= end_ns:
-            at_sweep = settings.project.at == "sweep"
-            shown_ns = stretch[frame].sweep.stamp_ns if at_sweep else exposed_ns
-            shot = Shot(camera, neighbour_number, shown_ns)
-            neighbours[name] = _exposure(sequence, stretch, key, frame, shot, settings)
-    return neighbours
-
-
 def _exposure(
-    sequence: LidarSequence,
-    stretch: Stretch,
-    key: int,
-    frame: int,
-    shot: Shot,
-    settings: Config,
+    sequence: LidarSequence, stretch: Stretch, key: int, frame: int, shot: Shot, settings: Config
 ) -> Exposure:
     """Return the exposure of a shot (as `Exposure.of`), extrapolated from sweep ``frame``."""
     camera = shot.camera
@@ -320,14 +280,6 @@ def _exposure(
         number=shot.number,
         measure=camera.measure if measure == "auto" else measure,
     )
-
-
-class _Scale(NamedTuple):
-    """Columns of `PointsInImage` that depend on the lens."""
-
-    focal_px: Float  # (K,2) local scale, px per metre at a depth of 1 m
-    slope: Float  # (K,2) slope of inverse depth, not finite where the surface is seen edge-on
-    spacing_px: Float  # (K,2) spacing of neighbouring rays, across and down
 
 
 class PointsInImage(NamedTuple):
@@ -359,7 +311,8 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
     depth = exposure.depth_m(points_cam).astype(np.float32)
     normal = poses.rotate(exposure.T_cam_key, patches.normal.take(rows, axis=0).astype(np.float64))
     is_pinhole = exposure.camera.is_rectified and exposure.measure == "z"
-    scale = (_pinhole_scale if is_pinhole else _lens_scale)(
+    scale = _pinhole_scale if is_pinhole else _lens_scale
+    focal_px, slope, spacing_px = scale(
         exposure, points_cam, depth, normal, patches.spacing_m.take(rows, axis=0)
     )
     frame, far = cloud.frame[rows], cloud.far[rows]
@@ -368,9 +321,9 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
         uv=view.uv.take(order, axis=0),
         depth=depth,
         inverse=1 / depth.astype(np.float64),
-        focal_px=scale.focal_px,
-        slope=np.nan_to_num(scale.slope, posinf=0.0, neginf=0.0),
-        spacing_px=scale.spacing_px,
+        focal_px=focal_px,
+        slope=np.nan_to_num(slope, posinf=0.0, neginf=0.0),
+        spacing_px=spacing_px,
         frame=frame,
         age_ns=_ages_ns(cloud.since_key_ns[rows], frame, far),
         far=far,
@@ -379,8 +332,11 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
 
 def _pinhole_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> _Scale:
-    """Return the scale of points (K,3), normals (K,3) and spacings (K,2): a rectified image, z."""
+) -> tuple[Float, Float, Float]:
+    """Return ``focal_px``, ``slope`` and ``spacing_px`` of `PointsInImage`: a rectified image, z.
+
+    Normals (K,3) are in the camera frame. The slope is not finite where a patch is seen edge-on.
+    """
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
     distance = np.einsum("ij,ij->i", normal, points_cam)  # d
@@ -388,13 +344,13 @@ def _pinhole_scale(
         slope = normal[:, :2] / (distance[:, None] * focal_px)
     all_focal_px = np.broadcast_to(focal_px, points_cam[:, :2].shape)
     # Patches count as facing the camera.
-    return _Scale(all_focal_px, slope, spacing_m * focal_px / depth[:, None])
+    return all_focal_px, slope, spacing_m * focal_px / depth[:, None]
 
 
 def _lens_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
-) -> _Scale:
-    """Return the scale of points for any lens and measure; arguments as `_pinhole_scale`."""
+) -> tuple[Float, Float, Float]:
+    """Return the values of `_pinhole_scale` for any lens and measure."""
     # J (K,2,3): px that a point moves right and down in the image, per metre that it moves in space
     J = pixels_per_metre(exposure.camera, points_cam)
     focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
@@ -418,13 +374,11 @@ def _lens_scale(
     azimuth_axis /= np.maximum(np.linalg.norm(azimuth_axis, axis=1, keepdims=True), 1e-9)
     elevation_axis = np.cross(points_cam, azimuth_axis)
     elevation_axis /= np.linalg.norm(elevation_axis, axis=1, keepdims=True)
-    azimuth_px_per_m, elevation_px_per_m = (
-        np.einsum("ijk,ik->ij", J, axis) for axis in (azimuth_axis, elevation_axis)
+    azimuth_px, elevation_px = (
+        np.einsum("ijk,ik->ij", J, axis) * spacing_m[:, [column]]
+        for column, axis in enumerate((azimuth_axis, elevation_axis))
     )
-    spacing_px = np.hypot(
-        azimuth_px_per_m * spacing_m[:, :1], elevation_px_per_m * spacing_m[:, 1:]
-    )
-    return _Scale(focal_px, slope, spacing_px)
+    return focal_px, slope, np.hypot(azimuth_px, elevation_px)
 
 
 def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
@@ -435,16 +389,14 @@ def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
     """
     ages_ns = np.abs(since_key_ns)
     in_window = np.flatnonzero(~far)
-    window_frame = frame[in_window]
-
+    if not len(in_window):
+        return ages_ns
     # A table of ages by frame number, from the first frame of the window
-    first = int(window_frame.min(initial=np.iinfo(np.int32).max))
-    num_frames = max(0, int(window_frame.max(initial=-1)) + 1 - first)
-    sweep_ages_ns = np.zeros(num_frames, np.int64)
-    sweep_ages_ns[window_frame - first] = ages_ns[in_window]
-
+    row = frame[in_window] - frame[in_window].min()
+    sweep_ages_ns = np.zeros(row.max() + 1, np.int64)
+    sweep_ages_ns[row] = ages_ns[in_window]
     for younger, older in pairwise(np.argsort(sweep_ages_ns, kind="stable")):
         if sweep_ages_ns[older] - sweep_ages_ns[younger] < _SAME_AGE_NS:
             sweep_ages_ns[older] = sweep_ages_ns[younger]
-    ages_ns[in_window] = sweep_ages_ns[window_frame - first]
+    ages_ns[in_window] = sweep_ages_ns[row]
     return ages_ns

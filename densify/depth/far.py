@@ -56,11 +56,8 @@ def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> lis
     Some sweeps, 5 m of travel apart, test the points of the others. Points ahead of a sweep are
     tested by the next testing sweep at least 3.5 m farther, points behind it by the previous one.
     By then even a vehicle that drives along has left most of its place. At the ends of the road the
-    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side.
-
-    Args:
-        sweeps: S deskewed sweeps.
-        travel_m: (S,) ascending positions of the sweeps along the road.
+    last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side. The S
+    deskewed sweeps have the ascending positions ``travel_m`` (S,) along the road.
     """
     testers = _choose_testers(travel_m)
     with ThreadPoolExecutor(num_threads()) as pool:
@@ -95,12 +92,10 @@ def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> lis
 
 def _choose_testers(travel_m: Float) -> list[int]:
     """Return the indices of the testing sweeps: the first, the last, and some between."""
-    if not len(travel_m):
-        return []
-    testers = [0]
+    testers: list[int] = []
     last = len(travel_m) - 1
-    for index, sweep_m in enumerate(travel_m.tolist()):
-        if sweep_m - travel_m[testers[-1]] >= _TESTER_STEP_M or index == last > 0:
+    for index, sweep_m in enumerate(travel_m):
+        if index in (0, last) or sweep_m - travel_m[testers[-1]] >= _TESTER_STEP_M:
             testers.append(index)
     return testers
 
@@ -165,15 +160,9 @@ _EMPTY_WORLD = StaticWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) True for the points that a camera near its pose may observe: a fast test.
+    """Return (N,) True for points (N,3) that a camera up to ``slack_m`` from its pose may observe.
 
-    False is certain, unlike True. For a lens that is no pinhole all are True.
-
-    Args:
-        camera: The camera.
-        T_cam_world: (4,4) pose of the camera.
-        points: (N,3) points in the world frame.
-        slack_m: Greatest distance in metres of a position from the pose.
+    This is a fast test: False is certain, unlike True. For a lens that is no pinhole all are True.
     """
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
@@ -182,13 +171,12 @@ def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float)
     K, slack_m = camera.K.astype(np.float32), np.float32(slack_m)
     # A distorted image may show more than a pinhole of its matrix.
     widening = np.float32(1.2 if camera.distortion else 1.0)
-    # Slopes x / z and y / z of the rays at the edges of the image
-    right = widening * (camera.width_px - K[0, 2]) / K[0, 0]
-    left = -widening * K[0, 2] / K[0, 0]
-    bottom = widening * (camera.height_px - K[1, 2]) / K[1, 1]
-    top = -widening * K[1, 2] / K[1, 1]
-    inside: Bool = (x < right * z + slack_m) & (x > left * z - slack_m) & (z > -slack_m)
-    inside &= (y < bottom * z + slack_m) & (y > top * z - slack_m)
+    inside: Bool = z > -slack_m
+    for axis, position, size_px in ((0, x, camera.width_px), (1, y, camera.height_px)):
+        # Slopes x / z or y / z of the rays at both edges of the image
+        low = -widening * K[axis, 2] / K[axis, axis]
+        high = widening * (size_px - K[axis, 2]) / K[axis, axis]
+        inside &= (position < high * z + slack_m) & (position > low * z - slack_m)
     return inside
 
 
@@ -202,15 +190,8 @@ def far_cloud(
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
-    Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept.
-
-    Args:
-        world: Static points of the sweeps along the road.
-        T_key_world: (4,4) from the frame of ``world`` to the key sweep's lidar frame.
-        stretch: Registered sweeps of the window.
-        key: Frame number of the key sweep.
-        exposures: Cameras and times of the maps, by name of the map.
-        static_only: Leave out points that the first or the last sweep of the window saw through.
+    Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept. With
+    ``static_only``, points that the first or the last sweep of the window saw through are left out.
     """
     is_beyond = ~np.isin(world.frames, stretch.frames)
     rows = np.flatnonzero(is_beyond[world.source])

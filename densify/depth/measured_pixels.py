@@ -34,7 +34,7 @@ from densify.depth.patches import (
 from densify.depth.rays import MovingBody, Rays
 from densify.geometry.arrays import select_rows
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Bool, Camera, Cloud, Float32, Int, Patches, Reason
+from densify.geometry.types import Bool, Cloud, Float32, Int, Patches, Reason
 
 # Half size of the window around a pixel whose points are compared with the winner, in spacings of
 # rays, and its limits: more than half a spacing, so that neighbouring rays are in it
@@ -51,8 +51,6 @@ ALL_ROUND = 3.0
 """Extent of a surface without a depth discontinuity nearby, in radii of a laser's spot."""
 _BLOCK_PX = 16  # blocks within which the density of rays is about constant
 _JUMP = 1.6  # least factor between spacings beyond the last of a scanner's denser rings
-# Rows of the array that `_measure_pixels` fills, with the meaning of the fields of `_Winners`
-_DEPTH, _SWEEPS, _NEAREST_IN_TIME, _EDGE, _NUM_ROWS = range(5)
 
 
 class MapInputs(NamedTuple):
@@ -66,11 +64,6 @@ class MapInputs(NamedTuple):
     lab: Float32 | None = None  # (H,W,3) image in L*a*b*; None accepts no boundary pixel by it
     rays: Rays | None = None  # of the window; None rejects no pixel as seen through
     bodies: Mapping[int, MovingBody] = {}  # of moving objects, by instance number
-
-    @property
-    def camera(self) -> Camera:
-        """The camera whose view the map has."""
-        return self.view.exposure.camera
 
 
 @dataclass
@@ -126,41 +119,31 @@ def measure(inputs: MapInputs) -> MapRecord:
     Points beyond the window only measure what it leaves empty, away from depth discontinuities.
     Without ``visibility`` in the settings each pixel takes its nearest point.
     """
-    camera = inputs.camera
+    camera = inputs.view.exposure.camera
+    shape = (camera.height_px, camera.width_px)
     points = points_in_image(inputs.cloud, inputs.view, inputs.patches)
     in_window = select_rows(points, ~points.far) if points.far.any() else points
-    # The spacing of rays is that of the window's sweeps, unless none of their points is in view.
-    record = _empty_record(inputs, points, spaced=points if points.far.all() else in_window)
-    if not inputs.settings.visibility:
-        _measure_nearest(record, points, camera)
-        return record
-    _measure_visible(record, in_window, camera)
-    if points.far.any():
-        _measure_visible(record, points, camera, beyond_window=True)
-    return record
-
-
-def _empty_record(inputs: MapInputs, points: PointsInImage, spaced: PointsInImage) -> MapRecord:
-    """Return a record without depths; the spacing of rays is that of the points ``spaced``."""
-    shape = (inputs.camera.height_px, inputs.camera.width_px)
-    zero = np.zeros(shape, np.float32)
     no_image = np.zeros((0, 0, 3), np.float32)
-    return MapRecord(
-        depth_m=zero.copy(),
-        boundary_m=zero.copy(),
-        filled_m=zero.copy(),
-        rejected_m=zero.copy(),
-        confidence=zero.copy(),
+    empty = ("depth_m", "boundary_m", "filled_m", "rejected_m", "confidence", "edge")
+    record = MapRecord(
+        **{name: np.zeros(shape, np.float32) for name in empty},
         point=np.full(shape, -1, np.int32),
         tilt=np.zeros((*shape, 2), np.float32),
-        spacing_px=_spacing_px(spaced, shape),
+        # Of the window's sweeps, unless none of their points is in view
+        spacing_px=_spacing_px(in_window if len(in_window.rows) else points, shape),
         votes=np.ones(shape, np.float32),
-        edge=zero,
         on_body=np.zeros(shape, bool),
         lab=np.ascontiguousarray(no_image if inputs.lab is None else inputs.lab),
         points=points,
         reason=np.full(len(inputs.cloud), Reason.OUTSIDE, np.uint8),
     )
+    if not inputs.settings.visibility:
+        _measure_nearest(record)
+        return record
+    _measure_visible(record, in_window)
+    if points.far.any():
+        _measure_visible(record, points, beyond_window=True)
+    return record
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
@@ -190,96 +173,58 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     return np.ascontiguousarray(pixels[: shape[0], : shape[1]])
 
 
-def _measure_nearest(record: MapRecord, points: PointsInImage, camera: Camera) -> None:
+def _measure_nearest(record: MapRecord) -> None:
     """Measure each pixel by its nearest point, without occlusion or support tests."""
+    points = record.points
     equal_rank = np.zeros(len(points.rows), np.int64)  # the depth decides
-    start, order = sorted_by_pixel(points, equal_rank, camera)
+    start, order = sorted_by_pixel(points, equal_rank, record.depth_m.shape)
     pixel = np.flatnonzero(np.diff(start))  # pixels with a point
     nearest = order[start[pixel]]
     record.reason[points.rows] = Reason.NOT_CHOSEN
     record.depth_m.flat[pixel] = points.depth[nearest]
     record.edge.flat[pixel] = ALL_ROUND
-    _set_source(record, points, pixel, nearest)
+    record.point.flat[pixel] = points.rows[nearest]
+    record.tilt.reshape(-1, 2)[pixel] = points.slope[nearest]
 
 
-def _set_source(record: MapRecord, points: PointsInImage, pixel: Int, chosen: Int) -> None:
-    """Set the source of flat pixels (P,): the ``chosen`` (P,) of the points in the image."""
-    record.point.flat[pixel] = points.rows[chosen]
-    record.tilt.reshape(-1, 2)[pixel] = points.slope[chosen]
-
-
-class _Winners(NamedTuple):
-    """P pixels, the visible point that wins each, and the plane through the points around it."""
-
-    pixel: Int  # (P,) flat indices of the pixels
-    point: Int  # (P,) indices of the winners among the points in the image
-    depth_m: Float32  # (P,) depth of the plane at the pixel's centre
-    num_sweeps: Float32  # (P,) number of sweeps that agree with the plane
-    # (P,) 1 if, of the sweeps around the pixel, the one nearest to the key is among them, else 0
-    is_nearest_in_time: Float32
-    edge: Float32  # (P,) distance from a discontinuity, in radii of a laser's spot
-
-
-def _measure_visible(
-    record: MapRecord, points: PointsInImage, camera: Camera, beyond_window: bool = False
-) -> None:
+def _measure_visible(record: MapRecord, points: PointsInImage, beyond_window: bool = False) -> None:
     """Measure pixels without a depth by visible points, and set the reason of each point.
 
     The points are those of the window, or with ``beyond_window`` all, of which the window's stay.
     """
-    is_hidden = is_occluded(points, camera)
-    winners = _find_winners(record, points, is_hidden, camera)
+    shape = record.depth_m.shape
+    is_hidden = is_occluded(points, shape)
+    # Occluded points rank behind the oldest visible one, so a pixel's first point is its winner.
+    hidden_rank = int(points.age_ns.max(initial=0)) + 1
+    rank = np.where(is_hidden, hidden_rank, points.age_ns)
+    start, order = sorted_by_pixel(points, rank, shape)
+    by_pixel = _ByPixel(select_rows(points, order), is_hidden[order], start, shape)
+    values = np.zeros((4, record.depth_m.size), np.float32)
+    _measure_pixels.over_rows(record.depth_m.size, by_pixel, record.depth_m.ravel() > 0, values)
+    pixel = np.flatnonzero(values[0])
+    winner = order[start[pixel]]
+    depth_m, num_sweeps, is_nearest_in_time, edge = values[:, pixel]
+
     reasons = np.where(is_hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     if beyond_window:
         # The sweep nearest to the key need not agree, but six sweeps must, and there are no
         # boundary pixels.
-        is_supported = winners.num_sweeps >= _FAR_SWEEPS
-        is_inside = winners.edge >= _FAR_EDGE
+        is_supported, is_inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
         is_used = is_supported & is_inside
-        reasons[winners.point[~is_inside]] = Reason.EDGE
-        is_judged = points.far
+        reasons[winner[~is_inside]] = Reason.EDGE
     else:
-        is_supported = winners.is_nearest_in_time > 0
-        is_inside = winners.edge >= 1  # else it is a boundary pixel
-        is_used = is_supported
-        is_judged = ~points.far
-    reasons[winners.point[~is_supported]] = Reason.UNSUPPORTED
+        is_used = is_supported = is_nearest_in_time > 0
+        is_inside = edge >= 1  # else it is a boundary pixel
+    reasons[winner[~is_supported]] = Reason.UNSUPPORTED
+    is_judged = points.far == beyond_window
     record.reason[points.rows[is_judged]] = reasons[is_judged]
-    _set_pixels(record, points, select_rows(winners, is_used), is_inside[is_used])
 
-
-def _find_winners(
-    record: MapRecord, points: PointsInImage, is_hidden: Bool, camera: Camera
-) -> _Winners:
-    """Return the winners of the pixels without a depth; occluded points (K,) win no pixel."""
-    # Occluded points rank behind the oldest visible one, so a pixel's first point is its winner.
-    hidden_rank = int(points.age_ns.max(initial=0)) + 1
-    rank = np.where(is_hidden, hidden_rank, points.age_ns)
-    start, order = sorted_by_pixel(points, rank, camera)
-    has_depth = record.depth_m > 0
-    values = np.zeros((_NUM_ROWS, has_depth.size), np.float32)
-    by_pixel = _ByPixel(select_rows(points, order), is_hidden[order], start, has_depth.shape)
-    _measure_pixels.over_rows(has_depth.size, by_pixel, has_depth.ravel(), values)
-    pixel = np.flatnonzero(values[_DEPTH])
-    return _Winners(
-        pixel=pixel,
-        point=order[start[pixel]],
-        depth_m=values[_DEPTH, pixel],
-        num_sweeps=values[_SWEEPS, pixel],
-        is_nearest_in_time=values[_NEAREST_IN_TIME, pixel],
-        edge=values[_EDGE, pixel],
-    )
-
-
-def _set_pixels(
-    record: MapRecord, points: PointsInImage, winners: _Winners, is_inside: Bool
-) -> None:
-    """Measure the pixels of the winners; those that are not inside (P,) become boundary pixels."""
-    pixel = winners.pixel
-    record.depth_m.flat[pixel] = np.where(is_inside, winners.depth_m, 0)
-    record.boundary_m.flat[pixel] = np.where(is_inside, 0, winners.depth_m)
-    record.edge.flat[pixel] = winners.edge
-    _set_source(record, points, pixel, winners.point)
+    used = pixel[is_used]
+    record.depth_m.flat[used] = np.where(is_inside, depth_m, 0)[is_used]
+    record.boundary_m.flat[used] = np.where(is_inside, 0, depth_m)[is_used]
+    record.edge.flat[used] = edge[is_used]
+    record.point.flat[used] = points.rows[winner[is_used]]
+    record.tilt.reshape(-1, 2)[used] = points.slope[winner[is_used]]
 
 
 class _ByPixel(NamedTuple):
@@ -369,7 +314,12 @@ def _compare(by_pixel, winner, u0, v0, centre, tolerance, edge_px, moments, exte
 
 @Kernel
 def _measure_pixels(first, last, by_pixel, has_depth, values):  # type: ignore[no-untyped-def]
-    """Fill ``values`` (4,P), as in `_Winners`, at pixels without a depth that have a winner."""
+    """Fill ``values`` (4,P) at pixels without a depth that have a visible point.
+
+    They are the depth at the pixel's centre, the number of sweeps that agree, 1 if the sweep
+    nearest to the key of those around is among them, and the distance from a depth discontinuity in
+    radii of a laser's spot.
+    """
     moments, extent = np.empty(9), np.empty(8)
     points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
     for p in range(first, last):
@@ -395,11 +345,9 @@ def _measure_pixels(first, last, by_pixel, has_depth, values):  # type: ignore[n
         )
         deviation, _, _ = plane(moments, _RIDGE_PX2)
         deviation = min(max(deviation, -tolerance), tolerance)
-        values[_DEPTH, p] = 1 / limit_inverse(centre + deviation, inverse)
-        values[_SWEEPS, p] = _count(sweeps)
-        values[_NEAREST_IN_TIME, p] = is_nearest_in_time
-
+        values[0, p] = 1 / limit_inverse(centre + deviation, inverse)
+        values[1, p] = _count(sweeps)
+        values[2, p] = is_nearest_in_time
         # The discontinuity is where the surface ends first.
-        values[_EDGE, p] = ALL_ROUND
-        if has_background and spot_px > 0:
-            values[_EDGE, p] = extent.min() / spot_px
+        is_near_edge = has_background and spot_px > 0
+        values[3, p] = extent.min() / spot_px if is_near_edge else ALL_ROUND

@@ -15,12 +15,11 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from densify.depth.exposure import Exposure, Sight, pixel_of
-from densify.depth.fill import LEAST_SHARE
+from densify.depth.exposure import Exposure, pixel_of
+from densify.depth.fill import LEAST_SHARE, ROUNDED, VOTERS_REACH, votes_for
 from densify.depth.measured_pixels import MapRecord
 from densify.depth.patches import FOOTPRINT, HIDDEN_M, agree_m, hidden_m
 from densify.depth.rays import MovingBody, find_crossing, half_spaces
-from densify.depth.votes import ROUNDED, VOTERS_REACH, votes_for
 from densify.geometry import cameras
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.types import Cloud
@@ -85,7 +84,14 @@ class _Front(NamedTuple):
         sight = exposure.see(body.corners, body.velocity_m_s)
         if not sight.inside.any():
             return None
-        box = _image_box(sight, exposure, margin_px)
+        low = np.zeros(2, int)  # column and row
+        high = np.array([camera.width_px, camera.height_px])
+        # A hull that reaches behind the camera may cover the whole image.
+        if (exposure.depth_m(sight.points_cam) > cameras.NEAREST_M).all():
+            first = np.floor(np.nanmin(sight.uv, axis=0)).astype(int)
+            end = np.ceil(np.nanmax(sight.uv, axis=0)).astype(int) + 1  # exclusive
+            low, high = np.maximum(low, first - margin_px), np.minimum(high, end + margin_px)
+        box = slice(low[1], high[1]), slice(low[0], high[0])
         row, column = np.mgrid[box]
 
         # The viewing ray of each pixel enters the hull at its front.
@@ -100,36 +106,35 @@ class _Front(NamedTuple):
         inverse = np.divide(1, depth_m, out=np.zeros(len(ray)), where=meets)
         return _Front(box, inverse.reshape(row.shape))
 
-    def pixels(self, exposure: Exposure, points: Float, velocity_m_s: Float32) -> _Pixels:
-        """Return those of the points (N,3), key sweep's lidar frame, that lie within the box."""
+    def pixels(
+        self, exposure: Exposure, points: Float, velocity_m_s: Float32
+    ) -> tuple[Int, tuple[Int, Int], Float]:
+        """Return those of the points (N,3), key sweep's lidar frame, that lie within the box.
+
+        Returns:
+            point: (K,) indices of the points.
+            pixel: (K,) rows and (K,) columns in the box.
+            depth_m: (K,) depths of the points.
+        """
         sight = exposure.see(points, velocity_m_s)
-        # Points out of view may have no coordinates: NaN has no pixel.
-        row, column = pixel_of(np.where(sight.inside[:, None], sight.uv, -1))
-        box_row = row - self.box[0].start
-        box_column = column - self.box[1].start
+        point = np.flatnonzero(sight.inside)  # others may have no coordinates
+        row, column = pixel_of(sight.uv[point])
+        row, column = row - self.box[0].start, column - self.box[1].start
         height, width = self.inverse.shape
-        in_box = (
-            sight.inside
-            & (box_row >= 0)
-            & (box_row < height)
-            & (box_column >= 0)
-            & (box_column < width)
-        )
-        point = np.flatnonzero(in_box)
-        depth_m = exposure.depth_m(sight.points_cam[point])
-        return _Pixels(point, (box_row[point], box_column[point]), depth_m)
+        in_box = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        point = point[in_box]
+        return point, (row[in_box], column[in_box]), exposure.depth_m(sight.points_cam[point])
 
     def closed_share(self, body: MovingBody, exposure: Exposure, spacing_px: Float32) -> Float:
         """Return the (h,w) share, 0 to 1, of the rays entering at a pixel that end on the body."""
         # Each ray counts in the pixel where it enters the hull, blurred by the spot of the laser.
         blur_px = np.maximum(FOOTPRINT * np.median(spacing_px, axis=(0, 1)), 1.0)
-        entered = self.pixels(exposure, body.entries, body.velocity_m_s)
+        entry, pixel, depth_m = self.pixels(exposure, body.entries, body.velocity_m_s)
         # Rays that enter behind the front, on the far side of the hull, do not count.
-        front_m = 1 / np.maximum(self.inverse[entered.pixel], 1e-6)
-        is_at_front = entered.depth_m < front_m + hidden_m(front_m)
+        front_m = 1 / np.maximum(self.inverse[pixel], 1e-6)
+        is_at_front = depth_m < front_m + hidden_m(front_m)
         counts = np.zeros((2, *self.inverse.shape))  # of rays that pass, and that end
-        ends = body.ends[entered.point].astype(np.int64)
-        np.add.at(counts, (ends, *entered.pixel), is_at_front)
+        np.add.at(counts, (body.ends[entry].astype(np.int64), *pixel), is_at_front)
         num_passed, num_ended = (
             cv2.GaussianBlur(count, (0, 0), blur_px[0], sigmaY=blur_px[1]) for count in counts
         )
@@ -138,55 +143,10 @@ class _Front(NamedTuple):
         return np.where(self.inverse > 0, num_ended / (num_ended + num_passed), 0)
 
 
-def _image_box(sight: Sight, exposure: Exposure, margin_px: int) -> tuple[slice, slice]:
-    """Return the rows and columns of the image around a hull's corners, with a margin."""
-    low = np.zeros(2, int)  # column and row
-    high = np.array([exposure.camera.width_px, exposure.camera.height_px])
-    # A hull that reaches behind the camera may cover the whole image.
-    if (exposure.depth_m(sight.points_cam) > cameras.NEAREST_M).all():
-        first = np.floor(np.nanmin(sight.uv, axis=0)).astype(int)
-        end = np.ceil(np.nanmax(sight.uv, axis=0)).astype(int) + 1  # exclusive
-        low = np.maximum(low, first - margin_px)
-        high = np.minimum(high, end + margin_px)
-    return slice(low[1], high[1]), slice(low[0], high[0])
-
-
-class _Pixels(NamedTuple):
-    """Points in a box of the image."""
-
-    point: Int  # (K,) indices of the points
-    pixel: tuple[Int, Int]  # (K,) rows and (K,) columns in the box
-    depth_m: Float  # (K,) depths of the points
-
-
 def _close(
     record: MapRecord, cloud: Cloud, exposure: Exposure, rows: Int, body: MovingBody, front: _Front
 ) -> None:
     """Put a body, with points at ``rows`` of the cloud, into a record cut to the front's box."""
-    surface = _surface(record, rows, front)
-    surface_m = (1 / surface).astype(np.float32)
-    allowed_m = _AGREES * agree_m(surface_m)
-    share = front.closed_share(body, exposure, record.spacing_px)
-    shown = _show(record, cloud, surface, allowed_m, share)
-
-    # Returns of the body on its surface
-    returns = front.pixels(exposure, cloud.points[rows], cloud.velocity_m_s[rows])
-    error_m = abs(returns.depth_m - surface_m[returns.pixel])
-    agrees = shown.measurable[returns.pixel] & (error_m <= allowed_m[returns.pixel])
-    row, column = (index[agrees] for index in returns.pixel)
-    agreeing_rows = rows[returns.point[agrees]]
-
-    # The oldest return is written first, so the one nearest to the key in time stays.
-    oldest_first = np.argsort(-abs(cloud.since_key_ns[agreeing_rows]), kind="stable")
-    source = np.full(surface.shape, -1)
-    source[row[oldest_first], column[oldest_first]] = agreeing_rows[oldest_first]
-    measured = source >= 0
-    record.depth_m[shown.pixels] = np.where(measured, surface_m, 0)[shown.pixels]
-    record.point[measured] = source[measured]
-
-
-def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
-    """Return the (h,w) inverse depth (1/m) of a body's surface; arguments as in `_close`."""
     inside = front.inverse > 0
     measured_m = np.maximum(record.depth_m, record.boundary_m)
     on_body = inside & (measured_m > 0) & np.isin(record.point, rows)
@@ -195,23 +155,36 @@ def _surface(record: MapRecord, rows: Int, front: _Front) -> Float:
     on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
     # The surface is the front of the hull, with a smooth offset through the returns.
     offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
-    return np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)
+    surface = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)  # 1/m
+    surface_m = (1 / surface).astype(np.float32)
+    allowed_m = _AGREES * agree_m(surface_m)
+    share = front.closed_share(body, exposure, record.spacing_px)
+    shown, measurable = _show(record, cloud, surface, allowed_m, share)
 
+    # Returns of the body on its surface
+    point, pixel, depth_m = front.pixels(exposure, cloud.points[rows], cloud.velocity_m_s[rows])
+    error_m = abs(depth_m - surface_m[pixel])
+    agrees = measurable[pixel] & (error_m <= allowed_m[pixel])
+    row, column = (index[agrees] for index in pixel)
+    agreeing_rows = rows[point[agrees]]
 
-class _Shown(NamedTuple):
-    """Pixels of a body in the box of its front."""
-
-    pixels: Bool  # (h,w) True where the body is shown
-    measurable: Bool  # (h,w) True where its returns count as measured
+    # The oldest return is written first, so the one nearest to the key in time stays.
+    oldest_first = np.argsort(-abs(cloud.since_key_ns[agreeing_rows]), kind="stable")
+    source = np.full(surface.shape, -1)
+    source[row[oldest_first], column[oldest_first]] = agreeing_rows[oldest_first]
+    measured = source >= 0
+    record.depth_m[shown] = np.where(measured, surface_m, 0)[shown]
+    record.point[measured] = source[measured]
 
 
 def _show(
     record: MapRecord, cloud: Cloud, surface: Float, allowed_m: Float | Float32, share: Float
-) -> _Shown:
-    """Show a body's surface (h,w), 1/m, in the record, and return where.
+) -> tuple[Bool, Bool]:
+    """Show a body's surface (h,w), 1/m, in the record.
 
     Returns of moving objects up to ``allowed_m`` (h,w) behind it stay. ``share`` (h,w) is that of
-    the rays that end on the body, 0 outside its hull.
+    the rays that end on the body, 0 outside its hull. Returned are two (h,w) masks: where the body
+    is shown, and where its returns count as measured.
     """
     inside = share > 0
     surface_m = (1 / surface).astype(np.float32)
@@ -247,7 +220,7 @@ def _show(
     record.votes[outline] = votes
     record.filled_m[shown] = surface_m[shown]
     record.on_body |= shown
-    return _Shown(shown, measurable=shown if is_compact else core)
+    return shown, shown if is_compact else core
 
 
 def _erode(mask: Bool, margin_px: float) -> Bool:
@@ -266,8 +239,7 @@ def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
     pair_down = inside[:-1] & inside[1:]
     first = np.concatenate([number[:, :-1][pair_right], number[:-1][pair_down]])
     second = np.concatenate([number[:, 1:][pair_right], number[1:][pair_down]])
-    num_pixels = int(inside.sum())
-    shape = (num_pixels, num_pixels)
+    shape = (int(inside.sum()),) * 2
     half = sparse.coo_matrix((np.full(len(first), _SMOOTHNESS), (first, second)), shape).tocsr()
     ties = half + half.T  # symmetric
 

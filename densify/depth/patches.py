@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from densify.depth.exposure import PointsInImage, pixel_of
 from densify.free_space.sensor import Sensors
 from densify.geometry.compiled import Kernel, inlined
-from densify.geometry.types import Bool, Camera, Cloud, Float, Float32, Int, Patches
+from densify.geometry.types import Bool, Cloud, Float, Float32, Int, Patches
 
 AGREE_M, AGREE_FRACTION = 0.1, 0.02
 """Greatest deviation between points on one surface: metres plus share of the depth."""
@@ -49,20 +49,14 @@ def hidden_m(surface_m: Float | Float32) -> Float | Float32:
 def find_patches(
     cloud: Cloud, sensors: Sensors, origins: Mapping[int, Float], wanted: Bool | None = None
 ) -> Patches:
-    """Return the surface patches of a cloud.
+    """Return the surface patches of a cloud by `fit_tangents`.
 
-    A patch is tangent to the neighbouring returns of the same scanner and sweep. If the neighbours
-    are on no single surface, the patch faces the scanner.
-
-    Args:
-        cloud: The cloud of M points.
-        sensors: Scanners of the recording.
-        origins: Frame number of a sweep -> (S,3) origins of its scanners, key sweep's lidar frame.
-        wanted: (M,) True for points in view of a camera, None for all. Other points get zeros.
+    ``origins`` are the (S,3) origins of the scanners of each sweep, by its frame number, in the key
+    sweep's lidar frame.
     """
     frames, index = np.unique(cloud.frame, return_inverse=True)
-    sweep: NDArray[np.int32] = index.ravel().astype(np.int32)
-    sweep_origins = [origins[int(frame)] for frame in frames]
+    sweep: NDArray[np.int32] = index.astype(np.int32)
+    sweep_origins = [origins[frame] for frame in frames.tolist()]
     # In the rigid points the objects have the shape that each sweep measured.
     return fit_tangents(cloud.rigid_points, cloud.lidar, sweep, sensors, sweep_origins, wanted)
 
@@ -77,14 +71,14 @@ def fit_tangents(
 ) -> Patches:
     """Return the patches of M points, each tangent to the neighbours in its scanner's sweep.
 
-    A point p is on the tangent plane if normal · (p - origin) = 1. Spacings are metres between
-    neighbouring rays, along the azimuth and along the elevation.
+    A point p is on the tangent plane if normal · (p - origin) = 1. If the neighbours are on no
+    single surface, the patch faces the scanner. Spacings are metres between neighbouring rays,
+    along the azimuth and along the elevation.
 
     Args:
         points: (M,3) points, in any one frame.
         lidar: (M,) number of the scanner of each point.
         sweep: (M,) index of each point's sweep in ``origins``.
-        sensors: Scanners of the recording.
         origins: (S,3) origins of the scanners for each sweep, in the frame of the points.
         wanted: (M,) True for points that need a patch, None for all. Other points get zeros.
     """
@@ -301,12 +295,12 @@ def _fit_unordered(first, last, rows, spherical, table, grid, cells, normal, spa
         _put(i, spherical, table, slope_u * shortening, slope_v, normal, spacing)
 
 
-def is_occluded(points: PointsInImage, camera: Camera) -> Bool:
-    """Return (K,) True for points clearly behind the nearest patch that covers their pixel."""
+def is_occluded(points: PointsInImage, shape: tuple[int, ...]) -> Bool:
+    """Return (K,) True for points clearly behind the nearest patch in an image of shape (H,W)."""
     slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
     # At least half a pixel, so that each patch covers a pixel
     half_px = np.maximum(FOOTPRINT * points.spacing_px + slack_px, 0.5)
-    nearest = np.zeros((camera.height_px, camera.width_px), np.float32)
+    nearest = np.zeros(shape, np.float32)
     paint(points.uv, points.inverse, points.slope, half_px, nearest)
     with np.errstate(divide="ignore"):
         nearest_m = 1 / nearest[pixel_of(points.uv)].astype(np.float64)  # inf without a patch
@@ -337,16 +331,16 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
                 covered[k] = max(covered[k], np.float32(on_patch))
 
 
-def sorted_by_pixel(points: PointsInImage, rank: Int, camera: Camera) -> tuple[Int, Int]:
-    """Return ``start`` (H·W+1,) and ``order`` (K,): the K points in the image, by pixel.
+def sorted_by_pixel(points: PointsInImage, rank: Int, shape: tuple[int, ...]) -> tuple[Int, Int]:
+    """Return ``start`` (H·W+1,) and ``order`` (K,): K points in an image of shape (H,W), by pixel.
 
     Pixel p has the points ``order[start[p]:start[p + 1]]``, ascending by ``rank`` (K,). Of equal
     ranks the nearer point is first.
     """
     row, column = pixel_of(points.uv)
-    start = np.empty(camera.height_px * camera.width_px + 1, np.int64)
+    start = np.empty(shape[0] * shape[1] + 1, np.int64)
     order = np.empty(len(rank), np.int64)
-    pixel = row * camera.width_px + column
+    pixel = row * shape[1] + column
     _by_pixel(pixel, rank, points.depth, points.frame, points.uv, start, order)
     return start, order
 
@@ -402,8 +396,7 @@ def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
 
     The moments are means or sums of products of offsets u and v and of w, all from their means.
     """
-    # The inverse of the symmetric 2 x 2 matrix of the normal equations
-    determinant = uu * vv - uv * uv
+    determinant = uu * vv - uv * uv  # of the normal equations
     return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
 
 

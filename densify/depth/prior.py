@@ -88,14 +88,9 @@ def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth
 
 
 def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
-    """Return the curve from the values of a prior to depth with the least ``residual``.
+    """Return the curve from values (N,) of a prior to depths (N,) m with the least ``residual``.
 
-    A curve that turns near into far is rejected.
-
-    Args:
-        value: (N,) values of the prior, above 0.
-        depth_m: (N,) depths of the same pixels in metres, above 0.
-        kind: As in `complete`.
+    Both are above 0. A curve that turns near into far is rejected. ``kind`` is as in `complete`.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
     fits = [_fit_form(form, p, z) for form in _FORMS[kind]]
@@ -170,13 +165,12 @@ class _Cells(NamedTuple):
     @staticmethod
     def over(guide: Float32) -> _Cells:
         """Return up to 40,000 cells that cover the image ``guide`` (H,W), logarithm of depth."""
-        height, width = guide.shape
         size = max(1, int(np.ceil(np.sqrt(guide.size / _MAX_CELLS))))
         rows, columns = (
-            np.minimum(np.arange(0, length, size) + size // 2, length - 1)
-            for length in (height, width)
+            np.minimum(np.arange(0, length, size) + size // 2, length - 1) for length in guide.shape
         )
-        number = np.arange(height)[:, None] // size * len(columns) + np.arange(width) // size
+        row, column = (np.arange(length) // size for length in guide.shape)
+        number = row[:, None] * len(columns) + column
         return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), number)
 
     def membrane(self) -> sparse.csr_array:
@@ -238,17 +232,15 @@ def _correction(
 
     # A steep prior may be blurred. Differences there have little weight.
     flatness_weight = _robust_weight(steepness[pulls])
-    mean_error = 0.0
-    if len(deviation):
-        mean_error = float(np.average(np.abs(deviation), weights=flatness_weight))
+    mean_error = np.average(np.abs(deviation), weights=flatness_weight) if len(deviation) else 0.0
     # Pixels that deviate from a first solution are outliers.
     first = solve_membrane(flatness_weight, deviation, 0.0)
     weight = flatness_weight * _robust_weight(deviation - first[cell])
     correction = solve_membrane(weight, deviation, 0.0)
     # The mean error of known pixels nearby on the same surface; far from them, of the image.
     spread = solve_membrane(weight, np.abs(deviation - correction[cell]), mean_error)
-    at_pixels = cells.at_pixels(np.stack([correction, spread]), guide)
-    return at_pixels[0], at_pixels[1]
+    correction, spread = cells.at_pixels(np.stack([correction, spread]), guide)
+    return correction, spread
 
 
 def _robust_weight(deviation: Float | Float32) -> Float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Make one depth map from the accumulated cloud: one record that passes an ordered table of stages.
+"""Make one depth map from the accumulated cloud: one record that passes an ordered list of stages.
 
 The order of the points has no effect. The last stage rejects pixels that rays passed through, such
 as in the gaps of a fence. The image cannot decide this: a background measured from elsewhere lies
@@ -8,9 +8,6 @@ grids: Thrun et al., "Probabilistic Robotics", 2005, ch. 9).
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,38 +28,29 @@ _MAX_PASSING = 0.25  # share of passing rays above which a pixel is rejected
 _NUM_ITERATIONS = 6  # number of iterations of the search for a crossing
 
 
-class _Stage(NamedTuple):
-    """A stage of a record's way to a depth map."""
-
-    applies: bool  # False skips the stage
-    stage: Callable[..., None]  # changes the record, its first argument, in place
-    arguments: tuple[Any, ...] = ()  # its other arguments
-
-
 def project(inputs: MapInputs) -> DepthMap:
     """Return the depth map of a cloud in a camera's view, moving objects as at the view's time."""
-    record = measure(inputs)
-    for step in _stages(inputs):
-        if step.applies:
-            step.stage(record, *step.arguments)
-    return _finished(record, inputs)
-
-
-def _stages(inputs: MapInputs) -> tuple[_Stage, ...]:
-    """Return the stages in their order."""
-    cloud, view, settings, rays = inputs.cloud, inputs.view, inputs.settings, inputs.rays
+    cloud, view, settings = inputs.cloud, inputs.view, inputs.settings
     filled, visible = inputs.filled, settings.visibility
-    return (
-        _Stage(True, accept_boundary_pixels, (settings.rims,)),
-        _Stage(filled, fill, (settings.fill_reach,)),
-        _Stage(filled, fill_stars),
-        _Stage(filled and visible, close_bodies, (cloud, view.exposure, inputs.bodies)),
-        _Stage(visible and rays is not None, reject_seen_through, (cloud, view, rays)),
-        _Stage(visible, _rate, (cloud, inputs.camera)),
-        _Stage(not visible, _rate_by_age, (cloud,)),
-        _Stage(True, _set_reasons),
-        _Stage(filled and visible, measure_spots),
-    )
+    record = measure(inputs)
+    accept_boundary_pixels(record, settings.rims)
+    if filled:
+        fill(record, settings.fill_reach)
+        fill_stars(record)
+    if filled and visible:
+        close_bodies(record, cloud, view.exposure, inputs.bodies)
+    if visible and inputs.rays is not None:
+        reject_seen_through(record, cloud, view, inputs.rays)
+    if visible:
+        _rate(record, cloud, view.exposure.camera)
+    else:
+        _rate_by_age(record, cloud)
+    # Points in the map, and points removed from it
+    record.reason[record.point[record.boundary_m > 0]] = Reason.EDGE
+    record.reason[record.point[record.depth_m > 0]] = Reason.KEPT
+    if filled and visible:
+        measure_spots(record)
+    return _finished(record, inputs)
 
 
 def _rate(record: MapRecord, cloud: Cloud, camera: Camera) -> None:
@@ -83,16 +71,9 @@ def _rate_by_age(record: MapRecord, cloud: Cloud) -> None:
         record.confidence[shown] = np.maximum(source_confidence, _LEAST_CONFIDENCE)
 
 
-def _set_reasons(record: MapRecord) -> None:
-    """Set the reason of points in the map and of points removed from it."""
-    record.reason[record.point[record.boundary_m > 0]] = Reason.EDGE
-    record.reason[record.point[record.depth_m > 0]] = Reason.KEPT
-
-
 def _finished(record: MapRecord, inputs: MapInputs) -> DepthMap:
     """Return the record as a depth map, with the sweep that measured each pixel."""
-    shown, rejected = record.filled_m > 0, record.rejected_m > 0
-    no_confidence = np.float32(0)
+    shown = record.filled_m > 0
 
     def source_frames(mask: Bool) -> NDArray[np.int32]:
         """Return the (H,W) frame numbers of the sweeps that measured the pixels, else -1."""
@@ -100,21 +81,21 @@ def _finished(record: MapRecord, inputs: MapInputs) -> DepthMap:
         frame[mask] = inputs.cloud.frame[record.point[mask]]
         return frame
 
-    rejected_pixels = Rejected(
-        record.rejected_m,
-        np.where(shown, no_confidence, record.confidence),
-        source_frames(rejected & (record.boundary_m > 0)),
-    )
+    rejected = None
+    if record.evidence is not None:
+        is_measured = (record.rejected_m > 0) & (record.boundary_m > 0)
+        confidence = np.where(shown, np.float32(0), record.confidence)
+        rejected = Rejected(record.rejected_m, confidence, source_frames(is_measured))
     return DepthMap(
-        camera=inputs.camera.name,
+        camera=inputs.view.exposure.camera.name,
         depth_m=record.depth_m,
         filled_m=record.filled_m,
-        confidence=np.where(shown, record.confidence, no_confidence),
+        confidence=np.where(shown, record.confidence, np.float32(0)),
         frame=source_frames(record.depth_m > 0),
         reason=record.reason,
         measure=inputs.view.exposure.measure,
         evidence=record.evidence,
-        rejected=None if record.evidence is None else rejected_pixels,
+        rejected=rejected,
     )
 
 
@@ -125,13 +106,7 @@ def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Ray
     pixel where it crosses the surface of the map, clearly before its end. A ray stopped if its
     point has any other reason. It counts in the pixel of its point. Both counts are blurred by a
     third of the ray spacing. A pixel is rejected if more than a quarter of its rays passed through.
-    Moving bodies stay.
-
-    Args:
-        record: The map, with the reasons of all points.
-        cloud: The cloud of the record.
-        view: Points of the cloud in the image.
-        rays: Rays of the window; points of other sweeps do not count.
+    Moving bodies stay. Points of sweeps outside the window do not count.
     """
     in_window = np.isin(cloud.frame, rays.stretch.frames)
     counted = in_window & (record.reason != Reason.OUTSIDE)
@@ -211,5 +186,4 @@ def _share_at_depth(start: Float, end: Float, depth_m: Float, measure: str) -> F
         start_along_path = (start * path).sum(axis=1)
         range_difference = (start**2).sum(axis=1) - depth_m**2
         discriminant = start_along_path**2 - length_squared * range_difference
-        share = (np.sqrt(discriminant) - start_along_path) / length_squared
-        return share
+        return (np.sqrt(discriminant) - start_along_path) / length_squared

@@ -56,7 +56,9 @@ class Rays:
             offset_ns = registered.sweep.offset_ns
             if offset_ns is not None:
                 # From the reference time to the firing time the scanner moves with the lidar.
-                returns = _find_returns(registered.sweep, cloud.row[rows])
+                row = registered.sweep.row
+                order = np.argsort(row, kind="stable")
+                returns = order[np.searchsorted(row, cloud.row[rows], sorter=order)]
                 twists = registered.twist_before, registered.twist_after
                 origin = move_with_twists(origin, offset_ns[returns] * 1e-9, *twists)
             origins[rows] = poses.transform(self.stretch.T_target_source(self.key, frame), origin)
@@ -80,12 +82,6 @@ def _scanner_origins(sweep: Sweep) -> Float:
     return np.stack([sweep.origin_m(scanner) for scanner in range(num_scanners)])
 
 
-def _find_returns(sweep: Sweep, numbers: Int) -> Int:
-    """Return the (K,) indices in a sweep of the returns with these numbers in the recording."""
-    order = np.argsort(sweep.row, kind="stable")
-    return order[np.searchsorted(sweep.row, numbers, sorter=order)]
-
-
 def half_spaces(corners: Float) -> Float:
     """Return the (F,4) sides n, d of the corners' (V,3) convex hull, inside if n · x + d ≤ 0."""
     return np.unique(ConvexHull(corners).equations, axis=0)  # one for all triangles of a side
@@ -94,12 +90,8 @@ def half_spaces(corners: Float) -> Float:
 def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Float]:
     """Return the (K,) t at which lines start + t · direction enter a convex body, and leave it.
 
-    A line that misses the body leaves before it enters.
-
-    Args:
-        spaces: (F,4) sides of the body from `half_spaces`.
-        start: (K,3) points on the lines, or (3,) for all lines.
-        direction: (K,3) directions of the lines, of any length.
+    A line that misses the body leaves before it enters. The body has the sides (F,4) of
+    `half_spaces`. The lines start at (K,3), or all at (3,); their directions (K,3) have any length.
     """
     enter, leave = np.full(len(direction), -np.inf), np.full(len(direction), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -148,51 +140,32 @@ def rays_toward(
     """
     by_sweep: dict[int, list[ObjectRays]] = {instance: [] for instance in rows_of}
     for frame in rays.stretch.frames if rows_of else ():
-        for instance, object_rays in _sweep_rays(cloud, rays, frame, rows_of, corners).items():
-            by_sweep[instance].append(object_rays)
+        # The returns of the sweep, by their direction from the lidar
+        returns = np.flatnonzero(cloud.frame == frame)
+        lidar_origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
+        from_lidar = cloud.rigid_points.take(returns, axis=0) - lidar_origin
+        xy = from_lidar[:, :2].T.astype(np.float32)
+        bound_m = rays.origin_bound_m(frame)
+
+        # Motion of each object from the sweep's to the key's time, and the returns toward it
+        toward = dict[int, tuple[Float, Int]]()
+        for instance, rows in rows_of.items():
+            own = rows[cloud.frame[rows] == frame]
+            if len(own):
+                T_key_sweep = poses.fit_rigid(cloud.rigid_points[own], cloud.points[own])
+                hull = poses.transform(poses.inverse(T_key_sweep), corners[instance])
+                is_toward = _may_meet(xy, bound_m, hull - lidar_origin)
+                toward[instance] = T_key_sweep, returns[is_toward]
+
+        # All origins are found together, and cut into those of each object.
+        all_returns = np.concatenate([returns[:0], *(rows for _, rows in toward.values())])
+        origins = rays.origins_of(cloud.select(all_returns))
+        for instance, (T_key_sweep, rows) in toward.items():
+            start = poses.transform(T_key_sweep, origins[: len(rows)])
+            end = poses.transform(T_key_sweep, cloud.rigid_points[rows])
+            by_sweep[instance].append(ObjectRays(rows, start, end - start))
+            origins = origins[len(rows) :]
     return {instance: joined_rows(parts) for instance, parts in by_sweep.items()}
-
-
-def _sweep_rays(
-    cloud: Cloud,
-    rays: Rays,
-    frame: int,
-    rows_of: Mapping[int, Int],
-    corners: Mapping[int, Float],
-) -> dict[int, ObjectRays]:
-    """Return the rays of one sweep as `rays_toward`, for the objects that the sweep observes."""
-    # Motions of the objects from the sweep's to the key's time, in the key's lidar frame
-    motions = dict[int, Float]()
-    for instance, rows in rows_of.items():
-        sweep_rows = rows[cloud.frame[rows] == frame]
-        if len(sweep_rows):
-            motions[instance] = poses.fit_rigid(
-                cloud.rigid_points[sweep_rows], cloud.points[sweep_rows]
-            )
-
-    # The returns whose rays may meet each object, by their direction from the lidar
-    returns = np.flatnonzero(cloud.frame == frame)
-    lidar_origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
-    from_lidar = cloud.rigid_points.take(returns, axis=0) - lidar_origin
-    xy = from_lidar[:, :2].T.astype(np.float32)
-    bound_m = rays.origin_bound_m(frame)
-    returns_toward = dict[int, Int]()
-    for instance, T_key_sweep in motions.items():
-        hull = poses.transform(poses.inverse(T_key_sweep), corners[instance]) - lidar_origin
-        returns_toward[instance] = returns[_may_meet(xy, bound_m, hull)]
-
-    # All origins are found together, and cut into those of each object.
-    all_returns = np.concatenate([returns[:0], *returns_toward.values()])
-    origins = rays.origins_of(cloud.select(all_returns))
-    object_rays = {}
-    first = 0
-    for instance, T_key_sweep in motions.items():
-        rows = returns_toward[instance]
-        start = poses.transform(T_key_sweep, origins[first : first + len(rows)])
-        end = poses.transform(T_key_sweep, cloud.rigid_points[rows])
-        object_rays[instance] = ObjectRays(rows, start, end - start)
-        first += len(rows)
-    return object_rays
 
 
 def _may_meet(xy: Float32, bound_m: float, corners: Float) -> Bool:
@@ -234,35 +207,36 @@ def find_moving_bodies(
     """
     moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
     instance_of = cloud.instance[moving]
-    rows_of = {
-        instance: moving[instance_of == instance] for instance in np.unique(instance_of).tolist()
-    }
-    hulls = {instance: _hull_corners(cloud.points[rows]) for instance, rows in rows_of.items()}
-    velocity_m_s = {
-        instance: np.median(cloud.velocity_m_s[rows], axis=0) for instance, rows in rows_of.items()
-    }
+    shown_rows, hulls, velocities = dict[int, Int](), dict[int, Float](), dict[int, Float32]()
+    for instance in np.unique(instance_of).tolist():
+        rows = moving[instance_of == instance]
+        corners = _hull_corners(cloud.points[rows])
+        velocity_m_s = np.median(cloud.velocity_m_s[rows], axis=0)
+        if any(exposure.see(corners, velocity_m_s).inside.any() for exposure in exposures):
+            shown_rows[instance], hulls[instance] = rows, corners
+            velocities[instance] = velocity_m_s
 
-    def is_shown(instance: int) -> bool:
-        """Return True if a corner of the object's hull is in an image."""
-        return any(
-            exposure.see(hulls[instance], velocity_m_s[instance]).inside.any()
-            for exposure in exposures
+    bodies = {}
+    for instance, toward in rays_toward(cloud, rays, shown_rows, hulls).items():
+        corners = hulls[instance]
+        near = select_rows(toward, passes_near(corners, toward.start, toward.to_return))
+        enter, leave = find_crossing(half_spaces(corners), near.start, near.to_return)
+        meets = (enter > 0) & (enter < np.minimum(leave, 1))  # 0 is the origin, 1 the return
+        rows, start, to_return = select_rows(near, meets)
+        bodies[instance] = MovingBody(
+            corners=corners,
+            velocity_m_s=velocities[instance],
+            entries=start + enter[meets, None] * to_return,
+            ends=cloud.moving[rows] & (cloud.instance[rows] == instance),
+            frame=cloud.frame[rows],
         )
-
-    rows_of = {instance: rows for instance, rows in rows_of.items() if is_shown(instance)}
-    return {
-        instance: _body(cloud, instance, hulls[instance], velocity_m_s[instance], toward)
-        for instance, toward in rays_toward(cloud, rays, rows_of, hulls).items()
-    }
+    return bodies
 
 
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies without a sweep's rays, if they still span a volume without its points.
-
-    ``cloud`` holds the points of the other sweeps; ``frame`` is the number of the sweep left out.
-    """
+    """Return the bodies that span a volume in a ``cloud`` without this sweep, without its rays."""
     reduced_bodies = {}
     for instance, body in bodies.items():
         corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
@@ -283,51 +257,26 @@ def _hull_corners(points: Float) -> Float:
         return points[:0]
 
 
-def _body(
-    cloud: Cloud, instance: int, corners: Float, velocity_m_s: Float32, rays: ObjectRays
-) -> MovingBody:
-    """Return the body with this hull (V,3), and those of the ``rays`` that meet the hull."""
-    near = select_rows(rays, passes_near(corners, rays.start, rays.to_return))
-    enter, leave = find_crossing(half_spaces(corners), near.start, near.to_return)
-    meets = (enter > 0) & (enter < np.minimum(leave, 1))  # 0 is the origin, 1 the return
-    rows, start, to_return = select_rows(near, meets)
-    return MovingBody(
-        corners=corners,
-        velocity_m_s=velocity_m_s,
-        entries=start + enter[meets, None] * to_return,
-        ends=cloud.moving[rows] & (cloud.instance[rows] == instance),
-        frame=cloud.frame[rows],
-    )
-
-
 def complete_boxes(
     tracks: Sequence[ObjectTrack], cloud: Cloud, rays: Rays, ground: HeightMap
 ) -> tuple[ObjectTrack, ...]:
     """Return the tracks with completed boxes, and in ``sides_seen`` the sides that were seen.
 
     Where no ray shows free space a box grows to the usual size of a vehicle, and to the ground. A
-    side is seen if free space begins within 0.4 m of it. The bottom is never named.
-
-    Args:
-        tracks: The tracked objects, with boxes around their points.
-        cloud: The cloud of the window.
-        rays: The rays that measured the cloud.
-        ground: The ground in the world frame of their sweeps.
+    side is seen if free space begins within 0.4 m of it. The bottom is never named. ``ground`` is
+    in the world frame of the sweeps.
     """
     tracks = [_lower_to_ground(track, rays, ground) for track in tracks]
-    reach = {track.instance: _reach_corners(track, rays.key) for track in tracks}
-    rows_of = {
-        instance: np.flatnonzero(cloud.moving & (cloud.instance == instance)) for instance in reach
-    }
-    toward = rays_toward(cloud, rays, rows_of, reach)
-    completed = []
+    reach, rows_of = dict[int, Float](), dict[int, Int]()
     for track in tracks:
-        T_object_key = poses.inverse(track.T_key_object[track.frames.index(rays.key)])
-        object_rays = toward[track.instance]
-        start = poses.transform(T_object_key, object_rays.start)
-        to_return = poses.rotate(T_object_key, object_rays.to_return)
-        completed.append(_complete_box(track, start, to_return))
-    return tuple(completed)
+        # The space into which the box may grow, at both ends of each axis
+        reach_m = track.size_m + 2 * (_missing_m(track.size_m) + _BESIDE_M)
+        T_key_object = track.T_key_object[track.frames.index(rays.key)]
+        reach[track.instance] = poses.transform(T_key_object, corners_of(reach_m))
+        is_own = cloud.moving & (cloud.instance == track.instance)
+        rows_of[track.instance] = np.flatnonzero(is_own)
+    toward = rays_toward(cloud, rays, rows_of, reach)
+    return tuple(_complete_box(track, toward[track.instance], rays.key) for track in tracks)
 
 
 def _missing_m(size_m: Float) -> Float:
@@ -351,22 +300,18 @@ def _lower_to_ground(track: ObjectTrack, rays: Rays, ground: HeightMap) -> Objec
     return grow_box(track, 2, max(above_m, 0.0), 0.0)
 
 
-def _reach_corners(track: ObjectTrack, key: int) -> Float:
-    """Return the (8,3) corners, key frame, of the space into which a track's box may grow."""
-    growth_m = 2 * (_missing_m(track.size_m) + _BESIDE_M)  # at both ends of each axis
-    T_key_object = track.T_key_object[track.frames.index(key)]
-    return poses.transform(T_key_object, corners_of(track.size_m + growth_m))
-
-
 def corners_of(size_m: Float) -> Float:
     """Return the (8,3) corners, bottom and top in turn, of a box of (3,) m around the origin."""
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1)
     return signs.reshape(-1, 3) * size_m / 2
 
 
-def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectTrack:
-    """Return a track with its completed box, from rays (K,3) in the object's frame at the key."""
+def _complete_box(track: ObjectTrack, rays: ObjectRays, key: int) -> ObjectTrack:
+    """Return a track with its completed box, from the rays toward the object."""
     # Rays that cross the space into which the box may grow, between origin (0) and return (1)
+    T_object_key = poses.inverse(track.T_key_object[track.frames.index(key)])
+    start = poses.transform(T_object_key, rays.start)
+    to_return = poses.rotate(T_object_key, rays.to_return)
     missing_m = _missing_m(track.size_m)
     reach_m = track.size_m / 2 + missing_m + _BESIDE_M
     enter, leave = find_crossing(_box_spaces(-reach_m, reach_m), start, to_return)
@@ -381,10 +326,9 @@ def _complete_box(track: ObjectTrack, start: Float, to_return: Float) -> ObjectT
             _distance_to_free_space_m(track.size_m, missing_m, axis, sign, start, to_return)
             for sign in (-1, 1)
         ]
-        is_seen = [end_m <= _BESIDE_M for end_m in free_m]
-        sides_seen += [side for side, seen in zip(sides, is_seen, strict=True) if seen]
         # A seen side stays where it is. Free space limits the growth of the other.
-        room_m = [0.0 if seen else end_m for seen, end_m in zip(is_seen, free_m, strict=True)]
+        room_m = [end_m if end_m > _BESIDE_M else 0.0 for end_m in free_m]
+        sides_seen += [side for side, end_m in zip(sides, room_m, strict=True) if not end_m]
         if missing_m[axis] > 0 and sum(room_m):
             growth_m = _share_growth(float(missing_m[axis]), room_m)
             completed = grow_box(completed, axis, *growth_m)

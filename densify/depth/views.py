@@ -15,12 +15,12 @@ from densify.config import Config, ProjectSettings
 from densify.depth.confidence import nearest_pixel, reliability, tolerance, with_max_outliers
 from densify.depth.exposure import Exposure, InView, Shot, pixel_of
 from densify.depth.far import far_cloud
+from densify.depth.fill import to_lab
 from densify.depth.measured_pixels import MapInputs
 from densify.depth.moving_bodies import find_far_inside, fronts
 from densify.depth.patches import find_patches, hidden_m
 from densify.depth.project import project
 from densify.depth.rays import MovingBody, Rays, find_moving_bodies, without_sweep
-from densify.depth.votes import to_lab
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.cameras import convert_depth
@@ -93,30 +93,18 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
-        """Return the cameras and times of the maps of a key sweep.
+        """Return the cameras and times of the maps of the key sweep, a frame of the window.
 
-        Images are used unless ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
-
-        Args:
-            sequence: The recording.
-            stretch: Registered sweeps of the window.
-            key: Frame number of the key sweep.
-            shots: What each map shows, by name of the map.
-            images: (H,W,3) RGB images by name of the map.
-            settings: Configuration of the run.
+        Shots and (H,W,3) RGB images are by name of the map. Images are used unless
+        ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
         """
         sensors = Sensors.of(stretch.sweeps)
         exposures = {
             name: Exposure.of(sequence, stretch, key, shot, settings)
             for name, shot in shots.items()
         }
-        misaligned_maps = frozenset[str]()
-        lab_images = dict[str, Float32]()
-        if settings.project.rims != "strict" and images:
-            misaligned_maps = _misaligned_maps(stretch[key].sweep, exposures, images)
-            lab_images = {
-                name: to_lab(image) for name, image in images.items() if name not in misaligned_maps
-            }
+        used_images = {} if settings.project.rims == "strict" else images
+        misaligned_maps = _misaligned_maps(stretch[key].sweep, exposures, used_images)
         return Views(
             key=key,
             exposures=exposures,
@@ -127,7 +115,11 @@ class Views:
             },
             rays=Rays(stretch, key),
             settings=settings.project,
-            lab=lab_images,
+            lab={
+                name: to_lab(image)
+                for name, image in used_images.items()
+                if name not in misaligned_maps
+            },
             misaligned_maps=misaligned_maps,
         )
 
@@ -178,9 +170,8 @@ class Views:
                 bodies=seen.bodies,
             )
             depth_map = project(inputs)
-            if name in self.misaligned_maps:
-                depth_map = replace(depth_map, warnings=(_MISALIGNED,))
-            depth_maps[name] = depth_map
+            is_misaligned = name in self.misaligned_maps
+            depth_maps[name] = replace(depth_map, warnings=(_MISALIGNED,) * is_misaligned)
         return depth_maps
 
     def with_colours(
@@ -189,15 +180,10 @@ class Views:
         depth_maps: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """Return the cloud with the colours of the images that observe its points.
+        """Return the cloud with the colours of the (H,W,3) RGB images that observe its points.
 
         A point is observed unless it is clearly behind the depth of its pixel. Pixels without
-        depth give no colour.
-
-        Args:
-            seen: The cloud and its points in the images.
-            depth_maps: Depth maps of the cloud, by name of the map.
-            images: (H,W,3) RGB images, by name of the map.
+        depth give no colour. Maps and images are by name of the map.
         """
         rgb = seen.cloud.rgb.copy()
         for name, image in images.items():
@@ -214,12 +200,8 @@ class Views:
     ) -> Cloud:
         """Return the cloud with the greatest confidence of the pixels that agree with each point.
 
-        A pixel agrees if the point is no outlier there. Points that no map confirms have 0.
-
-        Args:
-            seen: The points in the images.
-            cloud: The same points.
-            depth_maps: Maps made of them, by name.
+        A pixel agrees if the point is no outlier there. Points that no map confirms have 0. The
+        points of ``cloud`` are those of ``seen``.
         """
         confidence = np.zeros(len(cloud), np.float32)
         for name, view in seen.in_view.items():
@@ -253,10 +235,7 @@ class Views:
     def optical_flow(
         self, cloud: Cloud, depth_maps: Mapping[str, DepthMap]
     ) -> dict[str, dict[str, Float32]]:
-        """Return name of the map -> "previous" or "next" -> (H,W,2) flow to that image in px.
-
-        Images outside the window have no entry, see `optical_flow`.
-        """
+        """Return name of the map -> "previous" or "next" -> (H,W,2) `optical_flow` in px."""
         return {
             name: {
                 image: optical_flow(cloud, depth_maps[name], exposure, neighbour)
@@ -291,19 +270,14 @@ class Views:
     ) -> dict[int, Mover]:
         """Return every moving object alone, by instance number.
 
-        Moving points without an object are together, with the number -1.
-
-        Args:
-            cloud: The cloud of the window.
-            visible: Leave out occluded and unsupported points.
-            bodies: Hulls of the moving objects, by instance number.
-            images: (H,W,3) RGB images, by name of the map.
+        Moving points without an object are together, with the number -1. Without ``visible``,
+        occluded and unsupported points count too. Images are (H,W,3) RGB, by name of the map.
         """
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
             seen = self.see(cloud.select(cloud.moving & (cloud.instance == instance)))
-            own_body = {instance: bodies[instance]} if instance in bodies else {}
-            seen = seen._replace(bodies=own_body)
+            if instance in bodies:
+                seen = seen._replace(bodies={instance: bodies[instance]})
             depth_maps = self.depth_maps(seen, visible)
             movers[instance] = Mover(self.with_colours(seen, depth_maps, images), depth_maps)
         return movers
@@ -313,16 +287,18 @@ def _misaligned_maps(
     key_sweep: Sweep, exposures: Mapping[str, Exposure], images: Mapping[str, NDArray[np.uint8]]
 ) -> frozenset[str]:
     """Return the names of the maps whose image edges miss the key sweep's depth discontinuities."""
+    if not images:
+        return frozenset()
     silhouettes = silhouettes_of(key_sweep)
-    names = list[str]()
-    for name, image in images.items():
-        exposure = exposures[name]
-        # The silhouettes are in the lidar frame of the key sweep's time. This pose includes the
-        # ego-motion between that time and the exposure.
-        camera = replace(exposure.camera, T_cam_lidar=exposure.T_cam_key)
-        if is_off(camera, silhouettes, image):
-            names.append(name)
-    return frozenset(names)
+    # The silhouettes are in the lidar frame of the key sweep's time. The exposures' poses include
+    # the ego-motion between that time and theirs.
+    cameras = {
+        name: replace(exposure.camera, T_cam_lidar=exposure.T_cam_key)
+        for name, exposure in exposures.items()
+    }
+    return frozenset(
+        name for name, image in images.items() if is_off(cameras[name], silhouettes, image)
+    )
 
 
 def optical_flow(
@@ -353,24 +329,19 @@ def with_ages(
 ) -> DepthMap:
     """Return the map with ``age_s``, seconds between its time and the source sweep of each pixel.
 
-    A filled pixel has the age of the nearest measured pixel in the image.
-
-    Args:
-        depth_map: The map.
-        stamps_ns: Times of the sweeps by frame number.
-        key: Frame number of the key sweep.
-        late_s: Time that the map shows, in seconds after the key sweep.
+    A filled pixel has the age of the nearest measured pixel in the image. The map shows the time
+    ``late_s`` seconds after the key sweep. ``stamps_ns`` has the times of the sweeps by frame.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
-    age_s = {frame: abs(stamp_ns - shown_ns) * 1e-9 for frame, stamp_ns in stamps_ns.items()}
     measured = depth_map.depth_m > 0
     has_depth = depth_map.filled_m > 0
-    ages = np.full(measured.shape, np.nan, np.float32)
+    ages_s = np.full(measured.shape, np.nan, np.float32)
     if measured.any():
         source_frame = depth_map.frame[nearest_pixel(measured)][has_depth]
         frames, index = np.unique(source_frame, return_inverse=True)
-        ages[has_depth] = np.array([age_s[int(frame)] for frame in frames])[index]
-    return replace(depth_map, age_s=ages)
+        sweep_ages_s = [abs(stamps_ns[frame] - shown_ns) * 1e-9 for frame in frames.tolist()]
+        ages_s[has_depth] = np.array(sweep_ages_s)[index]
+    return replace(depth_map, age_s=ages_s)
 
 
 class JudgedMap(NamedTuple):
@@ -386,7 +357,8 @@ class HeldOut:
     """The key sweep's returns as ground truth for maps made from its neighbouring sweeps alone."""
 
     views: Views
-    key_alone: Mapping[str, DepthMap]  # name -> map of the key sweep, without boundary pixels
+    # Name of a map -> (H,W) depth of the key sweep's returns in m without boundary pixels, 0 none
+    truth_m: Mapping[str, Float32]
     moving: Mapping[str, Bool]  # name of a map -> (H,W) True at moving returns of the key sweep
     gap_rad: float  # usual angle between neighbouring rings of the key sweep
 
@@ -396,40 +368,32 @@ class HeldOut:
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
         seen = views.see(key_cloud)
-        key_alone = {}
-        moving = {}
+        truth_m, moving = {}, {}
         for name, view in seen.in_view.items():
             depth_map = project(MapInputs(key_cloud, seen.patches, view, settings, filled=False))
             in_map = (depth_map.reason == Reason.KEPT) & key_cloud.moving
             is_moving = np.zeros(depth_map.depth_m.shape, bool)
             is_moving[pixel_of(view.uv[in_map[view.rows]])] = True
-            key_alone[name] = depth_map
-            moving[name] = is_moving
+            truth_m[name], moving[name] = depth_map.depth_m, is_moving
 
         elevation_spacing_m = seen.patches.spacing_m[:, 1]
         gap_rad = elevation_spacing_m / np.linalg.norm(key_cloud.points, axis=1)
-        # Points out of view have no patch, and so no spacing.
-        gap_rad = gap_rad[np.isfinite(gap_rad) & (gap_rad > 0)]
-        usual_gap_rad = float(np.median(gap_rad)) if len(gap_rad) else 0.0
-        return HeldOut(views, key_alone, moving, usual_gap_rad)
-
-    def without_key(self, seen: SeenCloud) -> SeenCloud:
-        """Return the cloud without the key sweep and its evidence on bodies."""
-        keep = seen.cloud.frame != self.views.key
-        cloud = seen.cloud.select(keep)
-        bodies = without_sweep(seen.bodies, cloud, self.views.key)
-        in_view = self.views.points_in_view(cloud)
-        return SeenCloud(cloud, seen.patches.select(keep), in_view, bodies)
+        gap_rad = gap_rad[gap_rad > 0]  # points out of view have no patch
+        return HeldOut(views, truth_m, moving, float(np.median(gap_rad)) if len(gap_rad) else 0.0)
 
     def judged_maps(self, seen: SeenCloud, visible: bool) -> dict[str, JudgedMap]:
         """Return each map of a cloud without the key sweep, by name; {} if no points remain."""
-        neighbours_only = self.without_key(seen)
-        if not len(neighbours_only.cloud):
+        keep = seen.cloud.frame != self.views.key
+        if not keep.any():
             return {}
+        # Without the key sweep's evidence on bodies too
+        cloud = seen.cloud.select(keep)
+        bodies = without_sweep(seen.bodies, cloud, self.views.key)
+        in_view = self.views.points_in_view(cloud)
+        neighbours_only = SeenCloud(cloud, seen.patches.select(keep), in_view, bodies)
         judged_maps = {}
         for name, depth_map in self.views.depth_maps(neighbours_only, visible).items():
-            moving = self.moving[name]
-            truth_m = self.key_alone[name].depth_m
+            moving, truth_m = self.moving[name], self.truth_m[name]
             exposure = self.views.exposures[name]
             inside = moving & find_far_inside(seen.bodies.values(), exposure, truth_m)
             truth_m = np.where(inside, np.float32(0), truth_m)
@@ -444,12 +408,11 @@ class HeldOut:
         pixels without a key return within a ray spacing.
         """
         scores: dict[str, Any] = {}
-        for name, judged in self.judged_maps(seen, visible).items():
+        for name, (judged_map, truth_m, moving) in self.judged_maps(seen, visible).items():
             camera = self.views.exposures[name].camera
-            truth_m = judged.truth_m
-            depth_map = with_max_outliers(judged.depth_map, self.views.settings.max_outliers)
+            depth_map = with_max_outliers(judged_map, self.views.settings.max_outliers)
             scores[name] = {
-                **depth_metrics.depth_scores(depth_map, truth_m, judged.moving, camera),
+                **depth_metrics.depth_scores(depth_map, truth_m, moving, camera),
                 "curve": depth_metrics.precision_density(depth_map, truth_m, camera),
                 "reliability": reliability(depth_map, truth_m, camera),
                 "unjudged": self._unjudged_shares(name, depth_map, seen.bodies),
@@ -461,12 +424,8 @@ class HeldOut:
     ) -> dict[str, float | None]:
         """Return the filled share (all, moving, static) without a key return nearby, or None."""
         exposure = self.views.exposures[name]
-        to_return_px = ndimage.distance_transform_edt(self.key_alone[name].depth_m == 0)
+        to_return_px = ndimage.distance_transform_edt(self.truth_m[name] == 0)
         unjudged = to_return_px > self.gap_rad * exposure.camera.focal_px
         filled = depth_map.filled_m > 0
         moving = fronts(bodies.values(), exposure) > 0
-        masks = {"all": filled, "moving": filled & moving, "static": filled & ~moving}
-        return {
-            part: float(unjudged[mask].mean()) if mask.any() else None
-            for part, mask in masks.items()
-        }
+        return depth_metrics.shares_by_motion(unjudged[filled], moving[filled])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud
+from densify.scores.depth_metrics import mean_or_none, shares_by_motion
 
 _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 
@@ -20,10 +21,6 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
     At a ghost's position, all returns of the key sweep in its cell and the eight around it, at
     least six, are farther by more than max(0.5 m, 2 % of its range). Dark paint and glass hide
     ghosts. Points of the key sweep and of sweeps beyond the window are False in both masks.
-
-    Args:
-        key_image: Range image of the key sweep.
-        key: Frame number of the key sweep.
     """
     ghost, unjudged = np.zeros((2, len(cloud)), bool)
     rows = np.flatnonzero(_others(cloud, key))
@@ -38,7 +35,7 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
     """Return the share of `ghosts` among the window's points of other sweeps, None without any."""
-    return _mean(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
+    return mean_or_none(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
 
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
@@ -55,14 +52,8 @@ def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any
     hundredths = np.rint(np.abs(cloud.since_key_ns[rows]) / 1e7).astype(np.int64)
     return {
         "num_points": len(rows),
-        "all": _mean(ghost),
-        "moving": _mean(ghost[moving]),
-        "static": _mean(ghost[~moving]),
-        "unjudged": {
-            "all": _mean(unjudged),
-            "moving": _mean(unjudged[moving]),
-            "static": _mean(unjudged[~moving]),
-        },
+        **shares_by_motion(ghost, moving),
+        "unjudged": shares_by_motion(unjudged, moving),
         "by_distance": {str(steps): rate for steps, rate in _rates(ghost, distance).items()},
         "by_seconds": {f"{h / 100:.2f}": rate for h, rate in _rates(ghost, hundredths).items()},
     }
@@ -77,8 +68,3 @@ def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
     """Return the share of ghosts in each group number (N,) that has points, ascending."""
     num, num_ghosts = np.bincount(group), np.bincount(group, ghost)
     return {g: float(num_ghosts[g] / num[g]) for g in np.flatnonzero(num).tolist()}
-
-
-def _mean(values: np.ndarray) -> float | None:
-    """Return the mean, None for no values."""
-    return float(np.mean(values)) if len(values) else None

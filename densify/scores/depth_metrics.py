@@ -65,17 +65,11 @@ def depth_errors(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> DepthErrors:
-    """Return the errors of depths over the pixels with ground truth.
+    """Return the errors of depths over the pixels with ground truth, or those of a mask.
 
-    A depth z is an outlier if its disparity ``focal_px * baseline_m / z`` differs by more than 3 px
-    *and* by more than 5 % from the true disparity.
-
-    Args:
-        predicted_m: (H,W) map or (N,) list of depths, camera z in metres, 0 for none.
-        truth_m: True depths of the same shape.
-        mask: True at the pixels that count, None for all.
-        focal_px: Focal length fx.
-        baseline_m: Stereo baseline.
+    Both are (H,W) maps or (N,) lists of depths, camera z in metres, 0 for none. A depth z is an
+    outlier if its disparity ``focal_px * baseline_m / z`` differs by more than 3 px *and* by more
+    than 5 % from the true disparity.
     """
     has_truth = truth_m > 0 if mask is None else (truth_m > 0) & mask
     is_compared = has_truth & (predicted_m > 0)
@@ -90,17 +84,17 @@ def depth_errors(
         num_pixels=num_pixels,
         num_compared=num_compared,
         coverage=num_compared / num_pixels if num_pixels else None,
-        mae_m=_mean(error_m),
+        mae_m=mean_or_none(error_m),
         rmse_m=_root_mean_square(error_m),
-        imae_per_km=_mean(error_per_km),
+        imae_per_km=mean_or_none(error_per_km),
         irmse_per_km=_root_mean_square(error_per_km),
-        abs_rel=_mean(error_m / t),
-        sq_rel=_mean((error_m / t) ** 2),
-        delta_1=_mean(ratio < _DELTA),
-        delta_2=_mean(ratio < _DELTA**2),
-        delta_3=_mean(ratio < _DELTA**3),
-        outliers=_mean(is_outlier_depth(z, t, focal_px, baseline_m)),
-        outliers_1_px=_mean(focal_px * baseline_m * np.abs(1 / z - 1 / t) > 1),
+        abs_rel=mean_or_none(error_m / t),
+        sq_rel=mean_or_none((error_m / t) ** 2),
+        delta_1=mean_or_none(ratio < _DELTA),
+        delta_2=mean_or_none(ratio < _DELTA**2),
+        delta_3=mean_or_none(ratio < _DELTA**3),
+        outliers=mean_or_none(is_outlier_depth(z, t, focal_px, baseline_m)),
+        outliers_1_px=mean_or_none(focal_px * baseline_m * np.abs(1 / z - 1 / t) > 1),
         silog=float(np.std(np.log(z / t))) if num_compared else None,
     )
 
@@ -110,11 +104,10 @@ def precision_density(
 ) -> list[dict[str, float | None]]:
     """Return density and share of outliers for each least confidence 0, 0.05, … 0.95.
 
-    ``truth_m`` is (H,W) true depth in metres, 0 for none. ``camera`` gives the focal length. Each
-    dictionary has ``min_confidence``, and for ``measured`` and ``filled`` depth: ``density_*``,
-    share of the pixels that keep a depth; ``outliers_*``, share of outliers among those with a true
-    depth; ``expected_*``, share of outliers that the confidence of the kept pixels promises. The
-    latter two are None without such pixels.
+    Each dictionary has ``min_confidence``, and for ``measured`` and ``filled`` depth:
+    ``density_*``, share of the pixels that keep a depth; ``outliers_*``, share of outliers among
+    those with a true depth ``truth_m``; ``expected_*``, share of outliers that the confidence of
+    the kept pixels promises. The latter two are None without such pixels.
     """
     curve = []
     for min_confidence in _LEAST_CONFIDENCES:
@@ -126,7 +119,7 @@ def precision_density(
             point[f"density_{name}"] = image_density(predicted_m)
             point[f"outliers_{name}"] = errors.outliers
             kept_confidence = maps.confidence[predicted_m > 0]
-            point[f"expected_{name}"] = _mean(outlier_probability(kept_confidence))
+            point[f"expected_{name}"] = mean_or_none(outlier_probability(kept_confidence))
         curve.append(point)
     return curve
 
@@ -186,7 +179,7 @@ def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
     for field in fields(DepthErrors):
         values = [value for image in images if (value := getattr(image, field.name)) is not None]
         counted = field.name.startswith("num_")
-        means[field.name] = sum(values) if counted else _mean(np.array(values))
+        means[field.name] = sum(values) if counted else mean_or_none(np.array(values))
     return DepthErrors(**means)
 
 
@@ -219,14 +212,19 @@ def scores_by_motion(
     }
 
 
+def shares_by_motion(mask: Bool, moving: Bool) -> dict[str, float | None]:
+    """Return the share of a mask (N,) among ``all``, ``moving`` and ``static`` rows, else None."""
+    parts = {"all": mask, "moving": mask[moving], "static": mask[~moving]}
+    return {name: mean_or_none(part) for name, part in parts.items()}
+
+
 def outlier_probability(confidence: Float | Float32) -> Float:
     """Return the probability, in the shape of ``confidence``, of an outlier by KITTI's rule.
 
     It is ``10 ** (-5 * confidence)``. A pixel value v above 0 of a confidence PNG means the
     confidence ``(v - 1) / 254``.
     """
-    probability: Float = 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
-    return probability
+    return 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
 
 
 def is_outlier_depth(
@@ -244,11 +242,10 @@ def is_outlier_depth(
 def _is_outlier(disparity_px: Float, true_px: Float) -> Bool:
     """Return (N,) True where a disparity is an outlier by KITTI's rule."""
     error_px = np.abs(disparity_px - true_px)
-    outlier: Bool = (error_px > OUTLIER_PX) & (error_px > OUTLIER_FRACTION * true_px)
-    return outlier
+    return (error_px > OUTLIER_PX) & (error_px > OUTLIER_FRACTION * true_px)
 
 
-def _mean(values: np.ndarray) -> float | None:
+def mean_or_none(values: np.ndarray) -> float | None:
     """Return the mean, None for no values."""
     return float(np.mean(values)) if len(values) else None
 

@@ -91,11 +91,7 @@ def silhouettes_of(sweep: Sweep) -> Silhouettes:
 
 
 def depth_edges(points: Float) -> Silhouettes:
-    """Return the depth discontinuities of one scanner's points (N,3), metres, in its own frame.
-
-    There inverse range, linear on a plane at any slant, lies above the line through both
-    neighbours.
-    """
+    """Return the depth discontinuities of one scanner's points (N,3), metres, in its own frame."""
     x, y, z = points.T
     range_m = np.linalg.norm(points, axis=1)
     azimuth = np.arctan2(y, x)
@@ -116,6 +112,7 @@ def depth_edges(points: Float) -> Silhouettes:
         before, middle, after = order[row - 1], order[row], order[row + 1]
 
         # The middle return is at an edge if it is nearer than the line through both neighbours.
+        # Inverse range is linear on a plane at any slant.
         share = gap[row - 1] / np.maximum(gap[row - 1] + gap[row], 1e-12)
         straight_inverse = (1 - share) / range_m[before] + share / range_m[after]
         far = np.where(range_m[before] > range_m[after], before, after)
@@ -133,10 +130,7 @@ def depth_edges(points: Float) -> Silhouettes:
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
-    """Return the (2,h,w) gradients of an image at a focal length of 700 px, and its scale.
-
-    They are the `View.strength` and `View.scale` of an (H,W,3) RGB image.
-    """
+    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -175,7 +169,7 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
     lines = _Lines.of(camera, view, np.zeros(4))
-    turns = _turns(np.zeros(1), np.zeros(1))
+    turns = _grid()
     scores = lines.scores(turns)
     # Half a step beyond the first step of the grid: turns within 0.3 degrees
     is_small = (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
@@ -188,16 +182,15 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best-fitting offset of a camera to two or more views.
+    """Return the best-fitting offset of a camera to two or more views, without delay or with it.
 
-    ``with_clock`` fits the delay of the images too, otherwise it is 0. Among equal local maxima,
-    the one that changes the fewest parameters is chosen.
+    Among equal local maxima, the one that changes the fewest parameters is chosen.
     """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
-    grid = _turns(_steps(2), np.zeros(1))
+    grid = _grid(2)
     if with_clock:
-        grid = np.concatenate([grid, _turns(np.zeros(1), _steps(3))])
+        grid = np.concatenate([grid, _grid(3)])
     # Scores on a grid of offsets, at every n-th discontinuity to save time
     thin = sum(len(line.uv) for line in lines) // _NUM_ON_GRID + 1
     on_grid = np.sum([line.scores(grid, thin) for line in lines], axis=0)
@@ -261,15 +254,13 @@ def num_changed(offsets: Float) -> Any:
     return (np.abs(offsets) > 3 * _BLURRED).sum(axis=-1)
 
 
-def _steps(axis: int) -> Float:
-    """Return the values of a parameter on the grid; half a step keeps the last value."""
-    return np.arange(-_REACH[axis], _REACH[axis] + _STEP[axis] / 2, _STEP[axis])
-
-
-def _turns(roll: Float, delay: Float) -> Float:
-    """Return (M,4) offsets: all pitches and yaws of the grid, with each roll and each delay."""
-    axes = np.meshgrid(_steps(0), _steps(1), roll, delay, indexing="ij")
-    return np.stack(axes, axis=-1).reshape(-1, 4)
+def _grid(*others: int) -> Float:
+    """Return (M,4) offsets: all pitches and yaws, with each step of other parameters, or 0."""
+    axes = [np.zeros(1)] * 4
+    for axis in (0, 1, *others):
+        # Half a step keeps the last value.
+        axes[axis] = np.arange(-_REACH[axis], _REACH[axis] + _STEP[axis] / 2, _STEP[axis])
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 4)
 
 
 class _Lines(NamedTuple):

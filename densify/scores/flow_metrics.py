@@ -102,8 +102,10 @@ def challenge_scores(
         )
         for number in np.unique(class_number)
     }
-    columns = {name: [row[name] for row in bucketed.values()] for name in ("static_m", "dynamic")}
-    means = {name: mean_of(_finite(column)) for name, column in columns.items()}
+    means = {}
+    for name in ("static_m", "dynamic"):
+        column = np.array([row[name] for row in bucketed.values()], np.float64)
+        means[name] = mean_of(column[np.isfinite(column)])
     return {
         "three_way": three_way,
         "bucketed": {**bucketed, "MEAN": means},
@@ -120,9 +122,3 @@ def _bucketed(error_m: Float, length_m: Float, bucket: NDArray[np.intp]) -> dict
     filled = lengths > 0
     quotients = errors[filled] / lengths[filled]
     return {"static_m": mean_of(error_m[bucket == 0]), "dynamic": mean_of(quotients)}
-
-
-def _finite(values: list[float]) -> Float:
-    """Return the finite values."""
-    array = np.array(values, np.float64)
-    return array[np.isfinite(array)]
