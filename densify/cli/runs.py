@@ -35,7 +35,7 @@ from densify.outputs.plots import order_front_first
 from densify.outputs.recording_folder import check_recording, default_folder
 from densify.outputs.viewers import show_in_open3d, show_in_rerun
 from densify.pipeline import run as pipeline
-from densify.pipeline.key_result import COMPARED
+from densify.pipeline.key_result import USUAL
 from densify.readers import Spec, open_sequence
 from densify.readers.depth_trees import pair_depth_files
 from densify.readers.timeline import format_frames
@@ -154,7 +154,7 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
             options.camera,
             config,
             progress,
-            options.methods or COMPARED,
+            options.methods or USUAL,
         )
     paths = write_comparison(
         results, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
