@@ -185,17 +185,9 @@ def answer_bench_depth(options: argparse.Namespace) -> Iterator[Answer]:
     for name, *changes in options.variant or []:
         variants[name] = resolve(options.config, [*(options.set or []), *changes])
     sequence, keys = open_sequence(recording_of(options)), options.key or _KEYS
+    wanted = (variants, options.camera, options.scanner, options.method)
     with progress_on_stderr() as progress:
-        measured = bench_depth(
-            sequence,
-            keys,
-            options.window,
-            variants,
-            options.camera,
-            options.scanner,
-            options.method,
-            progress,
-        )
+        measured = bench_depth(sequence, keys, options.window, *wanted, progress)
     configs = {name: as_mapping(config) for name, config in variants.items()}
     text = f"{measured['data']}, keys {', '.join(map(str, keys))}"
     facts = {**measured, "config": configs}

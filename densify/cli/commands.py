@@ -9,7 +9,7 @@ import shlex
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 
 from densify.cli.options import add_options
 from densify.config import presets
@@ -74,7 +74,8 @@ is 2 if something is wrong.
 
 == run (runs)
 make dense depth maps of one key frame or several
---key K...  number of the frame to densify; may be given several times
+--key K...  number of the frame to densify; may be given several times (default: the middle frame
+    of the recording)
 --keys A:B[:S]  frames A to B-1, every S-th. Overlapping windows share registration and scene flow
 {_KEY_OPTIONS}
 {_METHOD}
@@ -354,10 +355,8 @@ class Verb(NamedTuple):
     def run(self, options: argparse.Namespace) -> Iterable[Answer]:
         """Import the verb's module and return its answers."""
         module = import_module(f"densify.cli.{self.module}")
-        answers: Iterable[Answer] = getattr(module, f"answer_{self.name.replace(' ', '_')}")(
-            options
-        )
-        return answers
+        answer = getattr(module, f"answer_{self.name.replace(' ', '_')}")
+        return cast("Iterable[Answer]", answer(options))
 
 
 VERBS = (*Verb.of_manual(_USUAL), *Verb.of_manual(_MORE))

@@ -111,16 +111,9 @@ def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
             f"{frames[0]}:{frames[-1] + 1}"
         )
     frames = frames if chosen is None else list(chosen)
+    wanted = (options.format, street, options.out, frames, options.camera)
     with progress_on_stderr() as progress:
-        folder = write_street(
-            options.format,
-            street,
-            options.out,
-            frames,
-            options.camera,
-            progress,
-            overwrite=options.overwrite,
-        )
+        folder = write_street(*wanted, progress, overwrite=options.overwrite)
     text = f"{len(frames)} frames; open them with --data {folder}"
     yield Answer(text, {"data": str(folder), "num_frames": len(frames)})
 
@@ -325,14 +318,10 @@ def answer_train_flow(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.learning.training import Training, train  # loads torch
 
     check_new_file(options.out, options.overwrite)
-    training = Training(
-        data=tuple(recordings_of(options, default="streets")),
-        teacher=options.teacher,
-        seed=options.seed,
-        steps=options.steps,
-        device=options.device,
-    )
+    data, steps = tuple(recordings_of(options, default="streets")), options.steps
+    training = Training(data, steps, options.teacher, options.seed, options.device)
     with progress_on_stderr() as progress:
         loss = train(training, options.out, progress)
-    text = f"{training.steps:,} steps, loss {loss:.4g}"
-    yield Answer(text, {"num_steps": training.steps, "loss": loss}, [options.out])
+    yield Answer(
+        f"{steps:,} steps, loss {loss:.4g}", {"num_steps": steps, "loss": loss}, [options.out]
+    )
