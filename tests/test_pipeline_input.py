@@ -62,36 +62,14 @@ def test_poses_of_the_data_set_are_checked_too():
         ({"cameras": ["back"]}, "camera back.*front"),
         ({"config": {"objective": {"alhpa": 1}}}, "alpha"),
         ({"method": "paper"}, "method paper: expected one of none, icp, flow"),
+        ({"methods": ("icp", "magic")}, "methods magic: expected some of none, icp, "),
+        ({"methods": []}, "methods: got no name, expected some of none, icp, "),
     ],
 )
 def test_bad_arguments_are_refused_before_anything_is_read(arguments, message):
     sequence = one_car(())
     with pytest.raises(InputError, match=message) as caught:
-        run(sequence, **{"key": KEY, "window": 1, **arguments})
+        make = compare if "methods" in arguments else run
+        make(sequence, **{"key": KEY, "window": 1, **arguments})
     assert "\n" not in str(caught.value)
     assert not sequence.read
-
-
-def test_unknown_methods_are_refused_before_anything_is_read():
-    sequence = one_car(())
-    for methods, got in ((("icp", "magic"), "magic: "), ([], ": got no name, ")):
-        with pytest.raises(InputError, match=f"methods ?{got}expected some of none, icp, "):
-            compare(sequence, KEY, 1, methods=methods)
-    assert not sequence.read
-
-
-class Sparse(TinySequence):
-    """One sweep has next to no returns."""
-
-    def __getitem__(self, frame):
-        sweep = super().__getitem__(frame)
-        return sweep.select(slice(50)) if frame == KEY + 1 else sweep
-
-
-def test_an_almost_empty_sweep_beside_the_key_ends_its_window():
-    sequence = Sparse(one_car(()).scene, range(7))
-    result = run(sequence, KEY, 1, "icp")
-    assert result.frames == (KEY - 1, KEY)
-    assert f"sweep {KEY + 1} has 50 points" in result.warnings[0]
-    with pytest.raises(InputError, match=rf"sweep {KEY + 1} has 50 points"):
-        run(sequence, KEY + 1, 1)

@@ -130,7 +130,7 @@ def test_windows_go_on_over_missing_sweeps_and_borders_of_blocks(
 
 
 class Damaged(TinySequence):
-    """One sweep cannot be read, has no pose, or is noise."""
+    """One sweep cannot be read, has no pose, is noise, or has next to no returns."""
 
     def __init__(self, sequence, bad: int, kind: str = "unreadable") -> None:
         super().__init__(sequence.scene, sequence.frames)
@@ -143,7 +143,7 @@ class Damaged(TinySequence):
         if frame == self.bad and self.kind == "garbage":
             noise = np.random.default_rng(frame).uniform(-40, 40, sweep.points.shape)
             sweep = replace(sweep, points=noise)
-        return sweep
+        return sweep.select(slice(50)) if (frame, self.kind) == (self.bad, "sparse") else sweep
 
     def T_world_lidar(self, frame: int) -> np.ndarray:
         if frame == self.bad and self.kind == "posed":
@@ -152,7 +152,13 @@ class Damaged(TinySequence):
 
 
 @pytest.mark.parametrize(
-    ("kind", "bad"), [("unreadable", BORDER - 1), ("posed", BORDER + 2), ("garbage", BORDER - 1)]
+    ("kind", "bad"),
+    [
+        ("unreadable", BORDER - 1),
+        ("posed", BORDER + 2),
+        ("garbage", BORDER - 1),
+        ("sparse", BORDER - 1),
+    ],
 )
 def test_only_the_sweep_that_is_in_the_way_is_left_out(kind: str, bad: int, tmp_path: Path) -> None:
     sequence = Damaged(across_border(), bad, kind)
@@ -161,7 +167,7 @@ def test_only_the_sweep_that_is_in_the_way_is_left_out(kind: str, bad: int, tmp_
         if key == bad:
             with pytest.raises((InputError, SweepError), match=str(bad)) as error:
                 drive.window(key)
-            assert isinstance(error.value, SweepError) == (kind == "garbage")
+            assert isinstance(error.value, SweepError) == (kind in ("garbage", "sparse"))
             assert "\n" not in str(error.value)
             continue
         near = [f for f in sequence.frames if abs(f - key) <= 2]
