@@ -171,7 +171,7 @@ BAD_COMMANDS: list[tuple[list[str], list[str]]] = [
     ([*RUN, "--windw", "3"], ["--windw", "did you mean --window?", "run --help"]),
     ([*RUN, "--win", "3"], ["--win"]),
     (["info", "kiti:{tmp}/x"], ["kiti:{tmp}/x", "did you mean kitti?"]),
-    ([*RUN[:-1], "/dev/null/out"], ["/dev/null"]),
+    ([*RUN[:-1], "/dev/null/out", STREET], ["--out /dev/null/out: /dev/null is not a folder"]),
     (["run", "--key", "x"], ["--key", "'x'", "whole number"]),
     (["run", "--key", "1" * 5000], ["argument --key: got '1111"]),
     (["run", "--out", ""], ["got an empty argument after '--out'"]),

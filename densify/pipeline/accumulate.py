@@ -178,7 +178,8 @@ def _fit_box(
 ) -> tuple[Float, Float]:
     """Return pose (4,4) and size (3,) of the box around points (N,3) with x along the motion.
 
-    All are in the key frame and metres. The motions (4,4) of the object from the key to its first and last sweep are in the key frame.
+    All are in metres and in the key frame, as the motions (4,4) of the object from the key to its
+    first and last sweep.
     """
     # Direction of the median point: its displacement by velocity or by pose, the longer one
     reference = np.median(points, axis=0)

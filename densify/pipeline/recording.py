@@ -156,7 +156,7 @@ class Recording:
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
         """Return the seconds around windows where motion is searched, and between its sweeps."""
         # The first readable key shows the number of points per second.
-        for key in sorted(keys) if self.settings.flow.look_around_s else ():
+        for key in sorted(keys) if self.settings.flow.look_around_s != 0 else ():
             with suppress(InputError):  # raised again where the key is made
                 num_points = len(self.sequence[key])
                 return self.settings.flow.around(num_points / (self.timeline.period_ns * 1e-9))
