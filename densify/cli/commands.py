@@ -7,9 +7,9 @@ import argparse
 import re
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from densify.cli.options import add_options
 from densify.config import presets
@@ -334,38 +334,11 @@ _GROUPS = {
 }
 
 
-class Verb(NamedTuple):
-    """A verb of the command line."""
-
-    name: str  # name of the verb, after the name of its group if it has one, such as "bench flow"
-    module: str  # module of this package with the function ``answer_NAME``, options -> answers
-    about: str  # description in the list of verbs
-    options: str  # table of the options, as `add_options` reads it
-    epilog: str  # further help
-
-    @staticmethod
-    def of_manual(manual: str) -> Iterator[Verb]:
-        """Yield the verbs of a manual."""
-        for section in re.split("^== ", manual, flags=re.MULTILINE)[1:]:
-            usage, _, epilog = section.strip().partition("\n\n")
-            title, about, options = usage.split("\n", 2)
-            name, _, module = title.rstrip(")").partition(" (")
-            yield Verb(name, module, about, options, epilog)
-
-    def run(self, options: argparse.Namespace) -> Iterable[Answer]:
-        """Import the verb's module and return its answers."""
-        module = import_module(f"densify.cli.{self.module}")
-        answer = getattr(module, f"answer_{self.name.replace(' ', '_')}")
-        return cast("Iterable[Answer]", answer(options))
-
-
-VERBS = (*Verb.of_manual(_USUAL), *Verb.of_manual(_MORE))
-
-
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse a command line, None for this process's.
 
-    The options hold the `Verb` as ``verb`` and the text of the command as ``command``.
+    The options hold ``verb``, its name after that of its group, such as "bench flow", ``module``
+    with its function, and ``command``, the text of the command.
     """
     parser = command_line()
     texts = list(sys.argv[1:] if arguments is None else arguments)
@@ -375,6 +348,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     options = parser.parse_args(texts)
     options.command = shlex.join(["densify", *texts])
     return options
+
+
+def answers(options: argparse.Namespace) -> Iterable[Answer]:
+    """Import the module of a parsed command, and return the answers of its function."""
+    module = import_module(f"densify.cli.{options.module}")
+    answer = getattr(module, f"answer_{options.verb.replace(' ', '_')}")
+    return cast("Iterable[Answer]", answer(options))
 
 
 def command_line() -> argparse.ArgumentParser:
@@ -389,14 +369,17 @@ def command_line() -> argparse.ArgumentParser:
         prog="densify", metavar="VERB", required=True, help=argparse.SUPPRESS
     )
     groups: dict[str, Any] = {"": commands}
-    for verb in VERBS:
-        group, _, name = verb.name.rpartition(" ")
+    for section in re.split("^== ", _USUAL + _MORE, flags=re.MULTILINE)[1:]:
+        usage, _, epilog = section.strip().partition("\n\n")
+        title, about, options = usage.split("\n", 2)
+        verb, _, module = title.rstrip(")").partition(" (")
+        group, _, name = verb.rpartition(" ")
         if group not in groups:
             group_parser = _add(commands, group, _GROUPS[group])
             groups[group] = group_parser.add_subparsers(metavar="WHAT", required=True)
-        verb_parser = _add(groups[group], name, verb.about, verb.epilog)
-        verb_parser.set_defaults(verb=verb)
-        add_options(verb_parser, "--json  print the results as one JSON object\n" + verb.options)
+        verb_parser = _add(groups[group], name, about, epilog)
+        verb_parser.set_defaults(verb=verb, module=module)
+        add_options(verb_parser, f"--json  print the results as one JSON object\n{options}")
     abouts = [f"  {name:<10}{verb.description}" for name, verb in commands.choices.items()]
     num_usual = _USUAL.count("== ")
     usual, more = "\n".join(abouts[:num_usual]), "\n".join(abouts[num_usual:])
