@@ -152,13 +152,7 @@ class Damaged(TinySequence):
 
 
 @pytest.mark.parametrize(
-    ("kind", "bad"),
-    [
-        ("unreadable", BORDER - 1),
-        ("posed", BORDER + 2),
-        ("garbage", BORDER - 1),
-        ("sparse", BORDER - 1),
-    ],
+    ("kind", "bad"), [("unreadable", BORDER - 1), ("posed", BORDER + 2), ("garbage", BORDER - 1)]
 )
 def test_only_the_sweep_that_is_in_the_way_is_left_out(kind: str, bad: int, tmp_path: Path) -> None:
     sequence = Damaged(across_border(), bad, kind)
@@ -167,12 +161,20 @@ def test_only_the_sweep_that_is_in_the_way_is_left_out(kind: str, bad: int, tmp_
         if key == bad:
             with pytest.raises((InputError, SweepError), match=str(bad)) as error:
                 drive.window(key)
-            assert isinstance(error.value, SweepError) == (kind in ("garbage", "sparse"))
+            assert isinstance(error.value, SweepError) == (kind == "garbage")
             assert "\n" not in str(error.value)
             continue
         near = [f for f in sequence.frames if abs(f - key) <= 2]
         side = [f for f in near if (f < bad) == (key < bad) and f != bad]
         assert drive.window(key).frames == tuple(side)
+
+
+def test_an_almost_empty_sweep_ends_the_window_beside_it(tmp_path: Path) -> None:
+    sequence = Damaged(across_border(), BORDER + 1, "sparse")
+    drive = drive_of(sequence, tmp_path, 1, resolve({"register": {"source": "kiss-icp"}}))
+    window = drive.window_frames(BORDER)
+    assert window.frames == (BORDER - 1, BORDER)
+    assert f"sweep {BORDER + 1} has 50 points" in window.cuts[0]
 
 
 def test_looking_around_changes_no_window(long_street) -> None:
