@@ -217,21 +217,11 @@ def answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify flow``: estimate scene flow between two point files, or of a recording."""
     config = config_of(options)
     asks_for_sweeps = options.all or options.keys is not None
-    if options.target is not None and options.data is None and not asks_for_sweeps:
-        if options.format is not None:
-            raise InputError(f"--format {options.format}: of recordings, got two point files")
-        yield _of_two_files(options, config)
+    if options.target is None or options.data is not None or asks_for_sweeps:
+        yield from _flow_of_recording(options, config)
         return
-    specs = [spec for spec in (options.source, options.data) if spec is not None]
-    if options.target is not None or len(specs) != 1 or options.all == (options.keys is not None):
-        raise InputError(
-            "densify flow: expected SOURCE and TARGET, two point files, or a recording with either "
-            "--all or --keys A:B[:S]; see densify flow --help"
-        )
-    yield from _of_recording(specs[0], options, config)
-
-
-def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
+    if options.format is not None:
+        raise InputError(f"--format {options.format}: of recordings, got two point files")
     out = options.out or Path("densify-out/flow.npz")
     check_new_file(out, options.overwrite, ".npz")
     source, target = read_points(Path(options.source)), read_points(options.target)
@@ -240,7 +230,7 @@ def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
     write_file(out, flow_npz(field))
     num_moving = int(field.moving.sum())
     facts = {"num_points": len(source), "num_moving": num_moving}
-    return Answer(f"{len(source):,} points, {num_moving:,} moving", facts, [out])
+    yield Answer(f"{len(source):,} points, {num_moving:,} moving", facts, [out])
 
 
 def read_points(path: Path) -> Float:
@@ -260,7 +250,14 @@ def read_points(path: Path) -> Float:
     return points
 
 
-def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Iterator[Answer]:
+def _flow_of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answer]:
+    specs = [spec for spec in (options.source, options.data) if spec is not None]
+    if options.target is not None or len(specs) != 1 or options.all == (options.keys is not None):
+        raise InputError(
+            "densify flow: expected SOURCE and TARGET, two point files, or a recording with either "
+            "--all or --keys A:B[:S]; see densify flow --help"
+        )
+    spec = specs[0]
     sequence = open_sequence(spec)
     out = options.out or default_folder(sequence.name)
     check_recording(out, sequence.name, spec)

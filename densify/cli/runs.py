@@ -29,7 +29,7 @@ from densify.config.errors import ComputationError, InputError
 from densify.dataset.report import write_comparison_page, write_report
 from densify.geometry.types import METHOD_NAMES, LidarSequence, Result
 from densify.outputs.atomic import plain
-from densify.outputs.export import Export, export_run, facts
+from densify.outputs.export import export_run, facts
 from densify.outputs.finished_run import Thresholds, finished_runs
 from densify.outputs.key_outputs import check_writable, write_comparison, write_result
 from densify.outputs.plots import order_front_first
@@ -253,7 +253,7 @@ def _comparison(results: Mapping[str, Result]) -> str:
 
 
 def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify export``: write a finished run in another format."""
+    """Answer ``densify export``: write a finished run in another format; yield what is left."""
     exported = export_run(
         options.run,
         options.to,
@@ -263,11 +263,6 @@ def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
         cameras=options.camera,
         overwrite=options.overwrite,
     )
-    yield Answer(_export_summary(exported), facts(exported), exported.paths)
-
-
-def _export_summary(exported: Export) -> str:
-    """Return a line per camera with its density before and after, and one line for the cloud."""
     lines = []
     for camera, products in exported.density.items():
         measured, filled = (
@@ -278,7 +273,7 @@ def _export_summary(exported: Export) -> str:
     points = exported.num_points
     if points is not None:
         lines.append(f"cloud: {points.after:,} of {points.before:,} points")
-    return "\n".join(lines)
+    yield Answer("\n".join(lines), facts(exported), exported.paths)
 
 
 def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
