@@ -46,30 +46,21 @@ if TYPE_CHECKING:
     from densify.readers import open_sequence as open_sequence
     from densify.scores.depth_metrics import outlier_probability as outlier_probability
 
-_HOME = {
-    "open_sequence": "densify.readers",
-    "run": "densify.pipeline.run",
-    "compare": "densify.pipeline.run",
-    "estimate_flow": "densify.flow.two_clouds",
-    "make_dataset": "densify.dataset.make",
-    "manifest": "densify.dataset.manifest",
-    "load_result": "densify.outputs.finished_run",
-    "run_keys": "densify.pipeline.run",
-    "Recipe": "densify.dataset.plan",
-    "outlier_probability": "densify.scores.depth_metrics",
-    "Gate": "densify.dataset.plan",
-    "Config": "densify.config",
-    "InputError": "densify.config.errors",
-    "ComputationError": "densify.config.errors",
-    "Camera": "densify.geometry.types",
-    "Cloud": "densify.geometry.types",
-    "DepthDataset": "densify.dataset.loader",
-    "DepthMap": "densify.geometry.types",
-    "FlowField": "densify.geometry.types",
-    "LidarSequence": "densify.geometry.types",
-    "Result": "densify.geometry.types",
-    "Sweep": "densify.geometry.types",
+_NAMES = {
+    "densify.config": "Config",
+    "densify.config.errors": "ComputationError InputError",
+    "densify.dataset.loader": "DepthDataset",
+    "densify.dataset.make": "make_dataset",
+    "densify.dataset.manifest": "manifest",
+    "densify.dataset.plan": "Gate Recipe",
+    "densify.flow.two_clouds": "estimate_flow",
+    "densify.geometry.types": "Camera Cloud DepthMap FlowField LidarSequence Result Sweep",
+    "densify.outputs.finished_run": "load_result",
+    "densify.pipeline.run": "compare run run_keys",
+    "densify.readers": "open_sequence",
+    "densify.scores.depth_metrics": "outlier_probability",
 }
+_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:

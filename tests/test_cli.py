@@ -15,15 +15,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import yaml
 
 from densify.cli import recordings
-from densify.cli.commands import VERBS
+from densify.cli.commands import parse
+from densify.cli.options import config_of
 from densify.cli.screen import Answer, progress_on_stderr
-from densify.config import Config, as_mapping, resolve
+from densify.config import as_mapping, resolve
 from densify.config.errors import ComputationError, InputError
 from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import BORDER, FRAMES, copy_drive, sweep_file
@@ -96,23 +96,6 @@ def test_output_is_kept_or_replaced_by_the_same_bytes(
     assert changed <= {f"{BORDER:06d}/run.yaml"}  # holds seconds
 
 
-def test_export_says_what_is_left(densified: SimpleNamespace, tmp_path: Path, capsys) -> None:
-    run, out = densified.out / f"{BORDER:06d}", tmp_path / "out"
-    command = ["export", run, "--to", "npy", "--out", out]
-    command += ["--min-confidence", "0.5", "--max-age-ms", "80"]
-    assert exit_code(*command) == 0
-    line, *paths = capsys.readouterr().out.splitlines()
-    shares = []
-    for product in ("depth", "depth_filled"):
-        shares.append(np.mean(cv2.imread(str(run / product / "image_02.png"), -1) > 0))
-        shares.append(np.mean(np.load(out / product / "image_02.npy") > 0))
-    named = [float(share) for share in re.findall(r"([\d.]+) %", line)]
-    np.testing.assert_allclose(named, 100 * np.array(shares), atol=0.0501)
-    assert shares[0] > shares[1] > 0 and shares[2] > shares[3] >= shares[1]
-    assert sorted(paths) == sorted(str(out / name) for name in files_in(out))
-    assert "--overwrite" in refused(capsys, 2, *command)
-
-
 def test_compare_prints_a_table_and_writes_it(border_drive: Path, tmp_path: Path, capsys) -> None:
     command = ["compare", border_drive, "--key", FRAMES[2], "--window", "1", "--config", "fast"]
     command += ["--set", "register.source=dataset", "--methods", "none, icp,flow"]
@@ -147,30 +130,25 @@ def test_several_keys_and_one_that_cannot_be_read(border_drive: Path, tmp_path: 
     assert files_in(tmp_path) == before
 
 
-@pytest.mark.parametrize(("verb", "function"), [("run", "run_keys"), ("compare", "compare")])
-def test_short_options_are_knobs_and_outputs_are_looked_at_first(
-    verb, function, tmp_path: Path, monkeypatch, capsys
-) -> None:
-    from densify.pipeline import run as pipeline
-
-    seen: list[Any] = []
-
-    def stop(*arguments: Any, **_: Any) -> None:
-        seen.extend(arguments)
-        raise ComputationError("enough")
-
-    monkeypatch.setattr(pipeline, function, stop)
-    command = [verb, STREET, "--key", "120", "--set", "output.movers=drop"]
-    command += ["--flow", "npz:some/flow", "--report"]
-    assert exit_code(*command, "--out", tmp_path / "out") == 1 and capsys.readouterr()
-    short = ["flow.engine=npz:some/flow", "output.report=true", "output.rejected=true"]
-    (config,) = (a for a in seen if isinstance(a, Config))
+def test_short_options_are_settings() -> None:
+    command = "run --set output.movers=drop --flow npz:some/flow --report --score"
+    short = ["flow.engine=npz:some/flow", "output.score=true"]
+    short += ["output.report=true", "output.rejected=true"]
+    config = config_of(parse(command.split()))
     assert config == resolve(None, ["output.movers=drop", *short])
-    seen.clear()
-    (tmp_path / "file").write_text("kept")
-    line = refused(capsys, 2, *command, "--out", tmp_path / "file" / "out")
-    assert str(tmp_path / "file") in line and not seen
-    assert files_in(tmp_path) == {"file": b"kept"}
+
+
+def test_without_a_key_the_middle_frame_is_taken_and_named(
+    border_drive: Path, tmp_path: Path, capsys
+) -> None:
+    assert exit_code("run", border_drive, *GIVEN, "--window", "0", "--out", tmp_path) == 0
+    told, middle = capsys.readouterr(), FRAMES[len(FRAMES) // 2]
+    named = (
+        f"densify: no --key given: taking the middle frame, {middle}, of {FRAMES[0]}-{FRAMES[-1]}"
+    )
+    assert named in told.err.splitlines()
+    assert told.out.startswith(f"key {middle}, ")
+    assert [path.name for path in tmp_path.iterdir()] == [f"{middle:06d}"]
 
 
 def test_the_recording_is_an_argument_or_an_option(border_drive: Path, capsys) -> None:
@@ -185,11 +163,6 @@ def test_the_recording_is_an_argument_or_an_option(border_drive: Path, capsys) -
     assert "got 2 recordings" in refused(capsys, 2, "info", "street", "--data", "street")
 
 
-def test_the_usual_verbs_have_few_options() -> None:
-    for verb in VERBS:
-        assert len(re.findall(r"^--", verb.options, re.M)) <= 15, verb.name
-
-
 # One command each that cannot work, and what its one line must say. {tmp} is an empty folder.
 RUN = ["run", "--key", "120", "--out", "{tmp}/out"]
 BAD_COMMANDS: list[tuple[list[str], list[str]]] = [
@@ -198,7 +171,7 @@ BAD_COMMANDS: list[tuple[list[str], list[str]]] = [
     ([*RUN, "--windw", "3"], ["--windw", "did you mean --window?", "run --help"]),
     ([*RUN, "--win", "3"], ["--win"]),
     (["info", "kiti:{tmp}/x"], ["kiti:{tmp}/x", "did you mean kitti?"]),
-    (["run", STREET], ["--key", "densify run --help"]),
+    ([*RUN[:-1], "/dev/null/out", STREET], ["--out /dev/null/out: /dev/null is not a folder"]),
     (["run", "--key", "x"], ["--key", "'x'", "whole number"]),
     (["run", "--key", "1" * 5000], ["argument --key: got '1111"]),
     (["run", "--out", ""], ["got an empty argument after '--out'"]),
@@ -345,16 +318,6 @@ def wait_until_computing(pid: int) -> None:
     pytest.fail("the process does not compute")
 
 
-def test_arguments_of_python_of_a_wrong_kind() -> None:
-    import densify
-
-    street = densify.open_sequence("street")
-    with pytest.raises(InputError, match=r"window '1': expected a whole number"):
-        densify.run(street, 120, "1")
-    with pytest.raises(InputError, match=r"cameras: got 'image_02', expected a list"):
-        densify.run(street, 120, 1, cameras="image_02")
-
-
 def test_without_a_terminal_progress_is_a_line_each_ten_seconds_and_at_the_end(
     monkeypatch, capsys
 ) -> None:
@@ -364,3 +327,47 @@ def test_without_a_terminal_progress_is_a_line_each_ten_seconds_and_at_the_end(
         for done in (0, 1, 2, 9):
             progress("keys", done, 9)
     assert capsys.readouterr().err == "densify: keys, 1 of 9\ndensify: keys, 9 of 9\n"
+
+
+def test_flow_between_two_files(tmp_path: Path, capsys) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-5, 5, (300, 3)) + np.array([20.0, 0, 0])
+    np.save(tmp_path / "a.npy", points)
+    np.savez(tmp_path / "b.npz", points=points)
+    out = tmp_path / "deep" / "flow.npz"
+    command = ["flow", tmp_path / "a.npy", tmp_path / "b.npz", "--out", out]
+    assert exit_code(*command) == 0
+    assert capsys.readouterr().out.splitlines() == ["300 points, 0 moving", str(out)]
+    with np.load(out) as arrays:
+        flow = arrays["residual_flow"]
+        assert flow.shape == (300, 3) and flow.dtype == np.float32 and not flow.any()
+        assert not arrays["moving"].any()
+        assert arrays["instance"].tolist() == [-1] * 300
+    before = out.read_bytes()
+    assert "--overwrite" in refused(capsys, 2, *command)
+    assert exit_code(*command, "--overwrite") == 0
+    assert out.read_bytes() == before
+    assert [path.name for path in out.parent.iterdir()] == ["flow.npz"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "out", "part"),
+    [
+        ("absent.npy", None, "f.npz", "absent.npy: cannot be read: No such file"),
+        ("flat.npy", np.zeros(9), "f.npz", "flat.npy: got an array of shape (9,)"),
+        ("nan.npy", np.diag([1, np.nan, 3]), "f.npz", "1 of 3 points are not finite, the first"),
+        ("garbage.npz", b"no zip", "f.npz", "garbage.npz: not a readable .npz"),
+        ("b.npy", np.ones((5, 3)), "flow.txt", "flow.txt: expected a name that ends in .npz"),
+        ("b.npy", np.ones((5, 3)), "folder.npz", "folder.npz: is a folder"),
+        ("b.npy", np.ones((5, 3)), "b.npy/deep/flow.npz", "cannot write in"),
+    ],
+)
+def test_bad_point_files_and_places_for_the_flow(name, content, out, part, tmp_path, capsys):
+    np.save(tmp_path / "good.npy", np.ones((5, 3)))
+    (tmp_path / "folder.npz").mkdir()
+    if isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+    elif content is not None:
+        np.save(tmp_path / name, content)
+    command = ["flow", tmp_path / "good.npy", tmp_path / name, "--out", tmp_path / out]
+    assert part in refused(capsys, 2, *command)

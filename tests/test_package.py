@@ -75,13 +75,6 @@ def test_public_names_exist() -> None:
         _ = densify.densfy
 
 
-def test_presets_are_those_of_the_repository() -> None:
-    sources = {path.stem: path for path in (CHECKOUT / "configs").glob("*.yaml")}
-    assert set(presets()) == set(sources)
-    for name, path in presets().items():
-        assert path.read_bytes() == sources[name].read_bytes()
-
-
 @needs_installation
 def test_the_installed_package_is_tested() -> None:
     assert version("densify-lidar") == densify.__version__
@@ -90,7 +83,9 @@ def test_the_installed_package_is_tested() -> None:
     assert scripts and scripts[0].value == "densify.cli:script"
     home = Path(densify.__file__).resolve().parent
     assert CHECKOUT not in home.parents, f"{home} is the checkout, not an installed package"
-    assert all(path.parent == home / "configs" for path in presets().values())
+    for path in (CHECKOUT / "configs").glob("*.yaml"):
+        assert presets()[path.stem].parent == home / "configs"
+        assert presets()[path.stem].read_bytes() == path.read_bytes()
     package = CHECKOUT / "densify"
     sources = {path.relative_to(package) for path in CODE}
     sources |= {p.relative_to(package) for p in (package / "outputs" / "page").iterdir()}
@@ -99,29 +94,10 @@ def test_the_installed_package_is_tested() -> None:
     assert not missing
 
 
-def test_the_readme_is_short_and_links_lead_somewhere() -> None:
-    readme = PAGES[CHECKOUT / "README.md"]
-    assert len(readme.splitlines()) <= 110 and len(readme.split()) <= 900
-    assert len(PAGES[CHECKOUT / "docs/results.md"].splitlines()) <= 150
+def test_links_of_pages_lead_somewhere() -> None:
     for page, text in PAGES.items():
         for link in re.findall(r"\]\(([^)#]+)", text):
             assert link.startswith("https://") or (page.parent / link).exists(), f"{page}: {link}"
-
-
-# Words that readers found riddling; docs/glossary.md has the field's words for the same.
-RIDDLES = (
-    r"\bwhat (?:stands|moves)\b|\bwho walks\b|\bin whose\b|\bof theirs\b|\bthe like of\b|"
-    r"registration alone|falsely moving|\bdepth edges?\b|\bego motion\b|standing still"
-)
-
-
-def test_pages_and_code_use_the_words_of_the_field() -> None:
-    more = [*(CHECKOUT / "configs").iterdir(), *(CHECKOUT / "densify").rglob("*.js")]
-    more += (CHECKOUT / "densify").rglob("*.html")
-    texts = {**CODE, **PAGES, **{path: path.read_text("utf-8") for path in more}}
-    for path, text in texts.items():
-        riddle = re.search(RIDDLES, text)
-        assert riddle is None, f"{path}: {riddle[0]}"
 
 
 def test_messages_and_pages_name_what_can_be_installed() -> None:
@@ -146,23 +122,7 @@ def test_the_pages_name_knobs_that_exist() -> None:
         resolve(None, [f"{section}.{key}{value or f'={said}'}"])
 
 
-def test_every_source_file_starts_with_its_license() -> None:
-    for folder in ("densify", "examples", "tests"):
-        for path in (CHECKOUT / folder).rglob("*.py"):
-            lines = path.read_text("utf-8").splitlines()
-            assert lines[0] == "# SPDX-License-Identifier: MIT", path
-            assert len(lines) == 1 or lines[1].startswith('"""'), f"{path}: no module docstring"
-
-
-def test_every_room_is_on_the_map_of_contributors() -> None:
-    rows = re.findall(r"^\| (`densify/.*?) \|", (CHECKOUT / "CONTRIBUTING.md").read_text(), re.M)
-    named = {name.removeprefix("densify/") for row in rows for name in re.findall("`(.*?)`", row)}
-    rooms = {path.parent.name for path in (CHECKOUT / "densify").glob("*/__init__.py")}
-    assert named == rooms
-
-
 BANNED = {
-    "a docstring without a subject": r'"""(Of|By|With|Without|On|To|In|For|At) [^"]*',
     # As SECURITY.md promises; where pickle may be used, `DOORS` says
     "running code of a file": (
         r"\b(eval|exec)\(|allow_pickle=True|(unsafe|full)_load|yaml\.(Unsafe|Full)?Loader\b"
@@ -202,6 +162,9 @@ def test_no_arrow_runs_upward() -> None:
     package = CHECKOUT / "densify"
     rooms = {p.stem for p in package.iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
     assert rooms - {"__init__", "__main__"} == set(floor)
+    rows = re.findall(r"^\| (`densify/.*?) \|", (CHECKOUT / "CONTRIBUTING.md").read_text(), re.M)
+    named = {name.removeprefix("densify/") for row in rows for name in re.findall("`(.*?)`", row)}
+    assert named == {path.parent.name for path in package.glob("*/__init__.py")}
     for path, text in CODE.items():
         room = path.relative_to(package).parts[0].removesuffix(".py")
         if room in floor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Movers kept, left out or apart; speeds; and the scores of a key held out."""
+"""`run` and `compare` on a small street: recorded poses, movers, scores, and bad arguments."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
+from densify.config.errors import ComputationError, InputError
+from densify.geometry import poses
 from densify.geometry.types import Cloud, Reason, Result
 from densify.outputs.cloud_files import read_cloud
 from densify.outputs.depth_png import read_depth_png
 from densify.outputs.key_outputs import write_result
 from densify.pipeline.run import compare, run
 from tests.scenes import ROOM, Arc, Scanner, Scene, TinySequence, World, by_flow
-from tests.small_street import CAR, KEY, POSES_GIVEN, one_car
+from tests.small_street import KEY, POSES_GIVEN, one_car
 from tests.tiny_street import same_points
 
 
@@ -89,18 +91,6 @@ def test_everything_asked_for_is_written(apart, tmp_path):
     assert np.array_equal(image[..., 0] == 1, known)
 
 
-# --- speed, and parts of a cloud ------------------------------------------------------------------
-
-
-def test_a_movers_velocity_is_its_own(kept):
-    cloud = kept.cloud
-    assert not cloud.velocity_m_s[~cloud.moving].any()
-    on_car = cloud.moving & (np.abs(cloud.points[:, 1] - 3.3) < 1.0)
-    assert on_car.sum() > 1000
-    median = np.median(cloud.velocity_m_s[on_car], axis=0)
-    np.testing.assert_allclose(median, [CAR.path.speed_m_s, 0, 0], atol=0.3)
-
-
 # --- the key held out -----------------------------------------------------------------------------
 
 
@@ -155,3 +145,62 @@ def test_every_point_is_accounted_for_and_a_map_says_what_was_left_out(kept, tmp
     write_result(kept, tmp_path, config=NPZ, data="street")
     path = tmp_path / f"{KEY:06d}" / "scene" / "reason" / "front.png"
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), left_out)
+
+
+# --- what is given --------------------------------------------------------------------------------
+
+
+class Jumping(TinySequence):
+    """Its recorded poses jump by 30 m at some frames."""
+
+    def __init__(self, jumps) -> None:
+        super().__init__(one_car(()).scene, range(7))
+        self.jumps = jumps
+
+    def T_world_lidar(self, frame):
+        T = super().T_world_lidar(frame)
+        T[0, 3] += 30.0 * self.jumps(frame)
+        return T
+
+
+def test_recorded_poses_are_taken_as_they_are_and_checked():
+    sequence = one_car(())
+    cloud = run(sequence, KEY, 1, "icp", config=POSES_GIVEN).cloud
+    mine = cloud.frame == KEY + 1
+    T_key_world = poses.inverse(sequence.T_world_lidar(KEY))
+    true = poses.transform(T_key_world, sequence.scene.scan(KEY + 1).world)
+    near = np.linalg.norm(sequence[KEY + 1].points, axis=1) >= 2.8
+    np.testing.assert_allclose(cloud.points[mine], true[near][cloud.row[mine]], atol=0.02)
+    moved_m = (T_key_world @ sequence.T_world_lidar(KEY + 1))[:3, 3]
+    assert np.linalg.norm(moved_m) == pytest.approx(0.4, abs=0.01)
+
+    once = run(Jumping(lambda frame: frame > KEY), KEY, 2, "icp", config=POSES_GIVEN)
+    assert once.frames == (KEY - 2, KEY - 1, KEY)
+    assert f"frame {KEY} to {KEY + 1}" in once.warnings[0]
+    with pytest.raises(ComputationError, match="registration jumps"):
+        run(Jumping(lambda frame: frame % 2), KEY, 2, "icp", config=POSES_GIVEN)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"key": 99}, "key 99"),
+        ({"key": 3.0}, r"key 3\.0: expected a frame's number"),
+        ({"key": [3]}, "key .3.: expected a frame's number"),
+        ({"window": True}, "window True"),
+        ({"cameras": 5}, "cameras: got 5, expected a list of names, such as .'front'."),
+        ({"window": -2}, "window -2"),
+        ({"cameras": ["back"]}, "camera back.*front"),
+        ({"config": {"objective": {"alhpa": 1}}}, "alpha"),
+        ({"method": "paper"}, "method paper: expected one of none, icp, flow"),
+        ({"methods": ("icp", "magic")}, "methods magic: expected some of none, icp, "),
+        ({"methods": []}, "methods: got no name, expected some of none, icp, "),
+    ],
+)
+def test_bad_arguments_are_refused_before_anything_is_read(arguments, message):
+    sequence = one_car(())
+    with pytest.raises(InputError, match=message) as caught:
+        make = compare if "methods" in arguments else run
+        make(sequence, **{"key": KEY, "window": 1, **arguments})
+    assert "\n" not in str(caught.value)
+    assert not sequence.read

@@ -130,7 +130,7 @@ def test_windows_go_on_over_missing_sweeps_and_borders_of_blocks(
 
 
 class Damaged(TinySequence):
-    """One sweep cannot be read, has no pose, or is noise."""
+    """One sweep cannot be read, has no pose, is noise, or has next to no returns."""
 
     def __init__(self, sequence, bad: int, kind: str = "unreadable") -> None:
         super().__init__(sequence.scene, sequence.frames)
@@ -143,7 +143,7 @@ class Damaged(TinySequence):
         if frame == self.bad and self.kind == "garbage":
             noise = np.random.default_rng(frame).uniform(-40, 40, sweep.points.shape)
             sweep = replace(sweep, points=noise)
-        return sweep
+        return sweep.select(slice(50)) if (frame, self.kind) == (self.bad, "sparse") else sweep
 
     def T_world_lidar(self, frame: int) -> np.ndarray:
         if frame == self.bad and self.kind == "posed":
@@ -167,6 +167,14 @@ def test_only_the_sweep_that_is_in_the_way_is_left_out(kind: str, bad: int, tmp_
         near = [f for f in sequence.frames if abs(f - key) <= 2]
         side = [f for f in near if (f < bad) == (key < bad) and f != bad]
         assert drive.window(key).frames == tuple(side)
+
+
+def test_an_almost_empty_sweep_ends_the_window_beside_it(tmp_path: Path) -> None:
+    sequence = Damaged(across_border(), BORDER + 1, "sparse")
+    drive = drive_of(sequence, tmp_path, 1, resolve({"register": {"source": "kiss-icp"}}))
+    window = drive.window_frames(BORDER)
+    assert window.frames == (BORDER - 1, BORDER)
+    assert f"sweep {BORDER + 1} has 50 points" in window.cuts[0]
 
 
 def test_looking_around_changes_no_window(long_street) -> None:

@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Sequence
 from typing import NoReturn, TextIO
 
-from densify.cli.commands import parse
+from densify.cli.commands import answers, parse
 from densify.cli.screen import Screen, screen
 from densify.config.errors import ComputationError, InputError, is_out_of_memory
 from densify.pipeline.process import keep_freed_memory
@@ -59,9 +59,8 @@ def script() -> NoReturn:
     """Run `main` as the process's entry point: the console script and ``python -m densify``."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(
-                errors="backslashreplace"
-            )  # characters that the terminal's encoding lacks
+            # Characters that the terminal's encoding lacks
+            stream.reconfigure(errors="backslashreplace")
     # Work is shared among our own threads. Those of OpenBLAS would wait in busy loops.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     keep_freed_memory()
@@ -88,7 +87,7 @@ def _run(arguments: Sequence[str] | None, shown: Screen) -> None:
         sys.stdout.flush()
         raise
     shown.begin(options)
-    for answer in options.verb.run(options):
+    for answer in answers(options):
         shown.show(answer)
 
 

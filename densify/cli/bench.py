@@ -15,7 +15,7 @@ from densify.bench.depth import bench_depth
 from densify.bench.doctor import bench_doctor
 from densify.bench.flow import DEFAULT_METHODS, bench_flow, tables
 from densify.bench.training import mean_and_error
-from densify.bench.verdicts import Verdict, verdicts
+from densify.bench.verdicts import verdicts
 from densify.cli.options import config_of, recording_of, recordings_of
 from densify.cli.screen import Answer, aligned, numbers_table, percent, progress_on_stderr, written
 from densify.config import as_mapping, resolve
@@ -86,10 +86,16 @@ def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
             {key: figures for key, figures in figures_of_key.items() if key in names}
             for figures_of_key in (stored.figures, now.figures)
         )
-        rows = list(verdicts(before, after, luck))
+        rows = []
+        for verdict in verdicts(before, after, luck):
+            key, change = verdict.worst
+            cells = [f"{value:.4g}" for value in (verdict.before, verdict.now)]
+            cells += [f"{value:+.4f}" for value in (verdict.change, verdict.error, verdict.luck)]
+            name, num_keys = verdict.figure, str(len(verdict.keys))
+            rows.append([name, num_keys, *cells, f"{key} {change:+.4f}", verdict.word])
         if rows:
             titles = [group, "keys", "before", "now", "change", "error", "luck", "worst", ""]
-            yield Answer(aligned([titles, *map(_verdict_cells, rows)]) + "\n")
+            yield Answer(aligned([titles, *rows]) + "\n")
     yield Answer(facts={"figures": now.figures, "luck": luck})
     if options.write is not None:
         merged = gate.Stored(stored.figures | now.figures, stored.luck | luck)
@@ -156,15 +162,6 @@ def _mean_cell(of_seeds: list[dict[str, Any]], test: str, part: str, error: str,
     return written(mean, form) + of_mean
 
 
-def _verdict_cells(verdict: Verdict) -> list[str]:
-    """Return the cells of a verdict in the table of a group."""
-    key, change = verdict.worst
-    numbers = [f"{verdict.before:.4g}", f"{verdict.now:.4g}"]
-    numbers += [f"{value:+.4f}" for value in (verdict.change, verdict.error, verdict.luck)]
-    worst = f"{key} {change:+.4f}"
-    return [verdict.figure, str(len(verdict.keys)), *numbers, worst, verdict.word]
-
-
 def answer_bench_doctor(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify bench doctor``: yield a table of the doctor's verdicts for each error."""
     config = config_of(options)
@@ -186,17 +183,9 @@ def answer_bench_depth(options: argparse.Namespace) -> Iterator[Answer]:
     for name, *changes in options.variant or []:
         variants[name] = resolve(options.config, [*(options.set or []), *changes])
     sequence, keys = open_sequence(recording_of(options)), options.key or _KEYS
+    wanted = (variants, options.camera, options.scanner, options.method)
     with progress_on_stderr() as progress:
-        measured = bench_depth(
-            sequence,
-            keys,
-            options.window,
-            variants,
-            options.camera,
-            options.scanner,
-            options.method,
-            progress,
-        )
+        measured = bench_depth(sequence, keys, options.window, *wanted, progress)
     configs = {name: as_mapping(config) for name, config in variants.items()}
     text = f"{measured['data']}, keys {', '.join(map(str, keys))}"
     facts = {**measured, "config": configs}

@@ -111,16 +111,9 @@ def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
             f"{frames[0]}:{frames[-1] + 1}"
         )
     frames = frames if chosen is None else list(chosen)
+    wanted = (options.format, street, options.out, frames, options.camera)
     with progress_on_stderr() as progress:
-        folder = write_street(
-            options.format,
-            street,
-            options.out,
-            frames,
-            options.camera,
-            progress,
-            overwrite=options.overwrite,
-        )
+        folder = write_street(*wanted, progress, overwrite=options.overwrite)
     text = f"{len(frames)} frames; open them with --data {folder}"
     yield Answer(text, {"data": str(folder), "num_frames": len(frames)})
 
@@ -224,21 +217,11 @@ def answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify flow``: estimate scene flow between two point files, or of a recording."""
     config = config_of(options)
     asks_for_sweeps = options.all or options.keys is not None
-    if options.target is not None and options.data is None and not asks_for_sweeps:
-        if options.format is not None:
-            raise InputError(f"--format {options.format}: of recordings, got two point files")
-        yield _of_two_files(options, config)
+    if options.target is None or options.data is not None or asks_for_sweeps:
+        yield from _flow_of_recording(options, config)
         return
-    specs = [spec for spec in (options.source, options.data) if spec is not None]
-    if options.target is not None or len(specs) != 1 or options.all == (options.keys is not None):
-        raise InputError(
-            "densify flow: expected SOURCE and TARGET, two point files, or a recording with either "
-            "--all or --keys A:B[:S]; see densify flow --help"
-        )
-    yield from _of_recording(specs[0], options, config)
-
-
-def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
+    if options.format is not None:
+        raise InputError(f"--format {options.format}: of recordings, got two point files")
     out = options.out or Path("densify-out/flow.npz")
     check_new_file(out, options.overwrite, ".npz")
     source, target = read_points(Path(options.source)), read_points(options.target)
@@ -247,7 +230,7 @@ def _of_two_files(options: argparse.Namespace, config: Config) -> Answer:
     write_file(out, flow_npz(field))
     num_moving = int(field.moving.sum())
     facts = {"num_points": len(source), "num_moving": num_moving}
-    return Answer(f"{len(source):,} points, {num_moving:,} moving", facts, [out])
+    yield Answer(f"{len(source):,} points, {num_moving:,} moving", facts, [out])
 
 
 def read_points(path: Path) -> Float:
@@ -267,7 +250,14 @@ def read_points(path: Path) -> Float:
     return points
 
 
-def _of_recording(spec: str, options: argparse.Namespace, config: Config) -> Iterator[Answer]:
+def _flow_of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answer]:
+    specs = [spec for spec in (options.source, options.data) if spec is not None]
+    if options.target is not None or len(specs) != 1 or options.all == (options.keys is not None):
+        raise InputError(
+            "densify flow: expected SOURCE and TARGET, two point files, or a recording with either "
+            "--all or --keys A:B[:S]; see densify flow --help"
+        )
+    spec = specs[0]
     sequence = open_sequence(spec)
     out = options.out or default_folder(sequence.name)
     check_recording(out, sequence.name, spec)
@@ -325,14 +315,10 @@ def answer_train_flow(options: argparse.Namespace) -> Iterator[Answer]:
     from densify.learning.training import Training, train  # loads torch
 
     check_new_file(options.out, options.overwrite)
-    training = Training(
-        data=tuple(recordings_of(options, default="streets")),
-        teacher=options.teacher,
-        seed=options.seed,
-        steps=options.steps,
-        device=options.device,
-    )
+    data, steps = tuple(recordings_of(options, default="streets")), options.steps
+    training = Training(data, steps, options.teacher, options.seed, options.device)
     with progress_on_stderr() as progress:
         loss = train(training, options.out, progress)
-    text = f"{training.steps:,} steps, loss {loss:.4g}"
-    yield Answer(text, {"num_steps": training.steps, "loss": loss}, [options.out])
+    yield Answer(
+        f"{steps:,} steps, loss {loss:.4g}", {"num_steps": steps, "loss": loss}, [options.out]
+    )

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,14 +29,14 @@ from densify.config.errors import ComputationError, InputError
 from densify.dataset.report import write_comparison_page, write_report
 from densify.geometry.types import METHOD_NAMES, LidarSequence, Result
 from densify.outputs.atomic import plain
-from densify.outputs.export import Export, export_run, facts
+from densify.outputs.export import export_run, facts
 from densify.outputs.finished_run import Thresholds, finished_runs
 from densify.outputs.key_outputs import check_writable, write_comparison, write_result
 from densify.outputs.plots import order_front_first
 from densify.outputs.recording_folder import check_recording, default_folder
 from densify.outputs.viewers import show_in_open3d, show_in_rerun
 from densify.pipeline import run as pipeline
-from densify.pipeline.key_result import COMPARED
+from densify.pipeline.key_result import USUAL
 from densify.readers import Spec, open_sequence
 from densify.readers.depth_trees import pair_depth_files
 from densify.readers.timeline import format_frames
@@ -68,6 +69,7 @@ _UNPAIRED = {
     "without_mask": "truth without mask",
 }
 _MOST_NAMED = 5
+_PRODUCTS = ("measured", "filled")
 
 
 def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
@@ -81,17 +83,9 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
         check_writable(out, key, options.overwrite)
     failures: dict[int, Exception] = {}
     warnings: list[tuple[str, str, int]] = []
+    wanted = (keys, options.window, options.method, options.camera, config)
     with progress_on_stderr() as progress:
-        results = pipeline.run_keys(
-            sequence,
-            keys,
-            options.window,
-            options.method,
-            options.camera,
-            config,
-            progress,
-            prior=options.prior,
-        )
+        results = pipeline.run_keys(sequence, *wanted, progress, prior=options.prior)
         for key, result in results:
             if isinstance(result, Exception):
                 failures[key] = result
@@ -115,17 +109,17 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
-    """Return the ascending key frame numbers of the options; raise InputError for wrong ones."""
+    """Return the ascending keys of the options, by default the recording's middle frame."""
     keys = {*(options.key or [])}
     if options.keys is not None:
         keys |= {*selected_frames(sequence, options.keys)}
+    frames = format_frames(sequence.frames)
     for key in sorted(keys - {*sequence.frames}):
-        frames = format_frames(sequence.frames)
         raise InputError(f"--key {key}: no such frame in {sequence.name}; it has {frames}")
     if not keys:
-        raise InputError(
-            "--key K or --keys A:B[:S]: expected the frame or frames to densify; "
-            "see densify run --help"
+        keys = {sequence.frames[len(sequence.frames) // 2]}
+        logging.getLogger("densify").info(
+            "no --key given: taking the middle frame, %d, of %s", *keys, frames
         )
     return sorted(keys)
 
@@ -146,16 +140,9 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     out = options.out or default_folder(sequence.name)
     check_recording(out, sequence.name, spec, [options.key])
     check_writable(out, options.key, options.overwrite, "compare")
+    wanted = (options.key, options.window, options.camera, config)
     with progress_on_stderr() as progress:
-        results = pipeline.compare(
-            sequence,
-            options.key,
-            options.window,
-            options.camera,
-            config,
-            progress,
-            options.methods or COMPARED,
-        )
+        results = pipeline.compare(sequence, *wanted, progress, options.methods or USUAL)
     paths = write_comparison(
         results, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
     )
@@ -185,19 +172,10 @@ def _summary(result: Result) -> str:
         line += f" ones, {share['full']} with those from the prior" if "full" in share else " ones"
         lines.append(line)
         if expected := look_up(result.metrics, "expected_outliers", name):
-            lines.append(
-                f"{name}, outliers expected by confidence: {percent(expected['measured'])} of the "
-                f"measured pixels, {percent(expected['filled'])} with filled ones"
-            )
-        found = [
-            look_up(result.metrics, "depth", name, product, "all", "outliers")
-            for product in ("measured", "filled")
-        ]
-        if None not in found:
-            lines.append(
-                f"{name}, outliers against exact truth: {percent(found[0])} of the measured "
-                f"pixels, {percent(found[1])} with filled ones"
-            )
+            lines.append(f"{name}, outliers expected by confidence: {_of_pixels(**expected)}")
+        exact = {p: look_up(result.metrics, "depth", name, p, "all", "outliers") for p in _PRODUCTS}
+        if None not in exact.values():
+            lines.append(f"{name}, outliers against exact truth: {_of_pixels(**exact)}")
     if ghosts := _beside_icp(result, "ghosts", "all"):
         lines.append(f"ghosts of the accumulated points: {ghosts}")
     for name in result.depth:
@@ -214,6 +192,10 @@ def _summary(result: Result) -> str:
                 "pixels"
             )
     return "\n".join(lines)
+
+
+def _of_pixels(measured: float | None, filled: float | None) -> str:
+    return f"{percent(measured)} of the measured pixels, {percent(filled)} with filled ones"
 
 
 def _beside_icp(result: Result, *path: str) -> str:
@@ -253,7 +235,7 @@ def _comparison(results: Mapping[str, Result]) -> str:
     cameras = list(next(iter(results.values())).depth)
     rows: list[tuple[str, tuple[str, ...], str]] = [("points", ("num_points",), ",d")]
     for camera in cameras:
-        for product in ("measured", "filled"):
+        for product in _PRODUCTS:
             rows.append((f"{camera} density, {product}", ("density", camera, product), ".1%"))
     rows.append(("ghost rate", ("ghosts", "all"), ".2%"))
     for camera in cameras:
@@ -271,7 +253,7 @@ def _comparison(results: Mapping[str, Result]) -> str:
 
 
 def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify export``: write a finished run in another format."""
+    """Answer ``densify export``: write a finished run in another format; yield what is left."""
     exported = export_run(
         options.run,
         options.to,
@@ -281,22 +263,17 @@ def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
         cameras=options.camera,
         overwrite=options.overwrite,
     )
-    yield Answer(_export_summary(exported), facts(exported), exported.paths)
-
-
-def _export_summary(exported: Export) -> str:
-    """Return a line per camera with its density before and after, and one line for the cloud."""
     lines = []
     for camera, products in exported.density.items():
         measured, filled = (
             f"{percent(products[p].before, digits=1)} -> {percent(products[p].after, digits=1)}"
-            for p in ("measured", "filled")
+            for p in _PRODUCTS
         )
         lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
     points = exported.num_points
     if points is not None:
         lines.append(f"cloud: {points.after:,} of {points.before:,} points")
-    return "\n".join(lines)
+    yield Answer("\n".join(lines), facts(exported), exported.paths)
 
 
 def answer_report(options: argparse.Namespace) -> Iterator[Answer]:

@@ -122,7 +122,7 @@ class Screen(logging.Handler):
 
     def begin(self, options: argparse.Namespace) -> None:
         """Start the answer of a command: read its name and ``--json`` from the options."""
-        verb = options.verb.name.rpartition(" ")[2]
+        verb = options.verb.rpartition(" ")[2]
         self._is_json = options.json
         self._facts = {"schema": _SCHEMA, "verb": verb, "files": [], "open_first": []}
 

@@ -11,13 +11,7 @@ import numpy as np
 from densify.depth.confidence import confidence_by_age
 from densify.flow.tracking.objects import LONG_M
 from densify.geometry import poses
-from densify.geometry.types import (
-    Cloud,
-    Float,
-    FlowField,
-    ObjectTrack,
-    Stretch,
-)
+from densify.geometry.types import Cloud, Float, FlowField, ObjectTrack, Stretch
 
 _LEAST_POINTS = 3  # points of an object in one sweep; fewer do not determine its rotation
 _AXLE = 0.3  # from the middle of a vehicle to its rear axle, as a share of its length
@@ -156,11 +150,11 @@ def _fit_track(
     duration_s = (stamps_ns[frames[-1]] - stamps_ns[frames[0]]) * 1e-9
     velocity_m_s = np.median([points.velocity_m_s for points in by_frame.values()], axis=0)
     points_key = np.concatenate([points.at_key for points in by_frame.values()])
-    box = _fit_box(
+    T_box, size_m = _fit_box(
         points_key, velocity_m_s, T_sweep_key[frames[0]], T_sweep_key[frames[-1]], duration_s
     )
 
-    T_key_object = np.stack([T_sweep_key[frame] @ box.T_key_object for frame in frames])
+    T_key_object = np.stack([T_sweep_key[frame] @ T_box for frame in frames])
     stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
     velocities_m_s = velocity_m_s[None]
     if len(frames) > 1:
@@ -169,29 +163,23 @@ def _fit_track(
     num_points = [len(by_frame[frame].at_sweep) if frame in by_frame else 0 for frame in frames]
     return ObjectTrack(
         instance=instance,
-        size_m=box.size_m,
+        size_m=size_m,
         frames=tuple(frames),
         stamp_ns=stamp_ns,
         T_key_object=T_key_object,
         velocity_m_s=velocities_m_s,
         num_points=np.array(num_points, np.int64),
-        seen_size_m=box.size_m,
+        seen_size_m=size_m,
     )
-
-
-class _Box(NamedTuple):
-    """The box around the points of an object."""
-
-    T_key_object: Float  # (4,4) pose at the key's time, key sweep's lidar frame
-    size_m: Float  # (3,) length, width, height
 
 
 def _fit_box(
     points: Float, velocity_m_s: Float, T_first_key: Float, T_last_key: Float, duration_s: float
-) -> _Box:
-    """Return the box around points (N,3), key frame, whose x axis is along the motion.
+) -> tuple[Float, Float]:
+    """Return pose (4,4) and size (3,) of the box around points (N,3) with x along the motion.
 
-    The motions (4,4) of the object from the key to its first and last sweep are in the key frame.
+    All are in metres and in the key frame, as the motions (4,4) of the object from the key to its
+    first and last sweep.
     """
     # Direction of the median point: its displacement by velocity or by pose, the longer one
     reference = np.median(points, axis=0)
@@ -213,4 +201,4 @@ def _fit_box(
         # A turn moves the axle relative to the reference by angle times lever.
         direction = direction + (yaw_last - yaw_first) * np.array([-y, x, 0])
     T_key_object[:3, 3] = T_key_object[:3, :3] @ ((low + high) / 2)
-    return _Box(T_key_object, high - low)
+    return T_key_object, high - low

@@ -7,7 +7,7 @@ import copy
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +28,10 @@ from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Bool, Cloud, DepthMap, Float32, Prior, Result, Stretch
 from densify.pipeline.process import Watch
 from densify.pipeline.recording import FarSurfaces, Moment
+from densify.readers.prior_files import PriorFiles
 from densify.registration.deskew import find_compensated
 from densify.scores import depth_metrics
 from densify.scores.cloud_scores import ghost_scores
-
-if TYPE_CHECKING:
-    from densify.readers.prior_files import PriorFiles
 
 _log = logging.getLogger("densify")
 
@@ -63,17 +61,15 @@ METHODS = {
 far range; the same with far range and visibility; scene flow without visibility; the published
 scene flow; our scene flow."""
 
-RUN = ("none", "icp", "flow")
-"""The methods of `run`; if scored, a method has the methods before it as its baselines."""
-COMPARED = ("none", "icp", "flow")
-"""The methods that `compare` shows by default."""
+USUAL = ("none", "icp", "flow")
+"""The methods of `run`, and those that `compare` shows by default."""
 
 
 def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
-    """Return the method of `RUN`, preceded by its simpler baselines if results are scored."""
-    if method not in RUN:
-        raise InputError(f"method {method}: expected one of {', '.join(RUN)}")
-    return RUN[: RUN.index(method) + 1] if settings.is_scored else (method,)
+    """Return the method of `run`, preceded by its simpler baselines if results are scored."""
+    if method not in USUAL:
+        raise InputError(f"method {method}: expected one of {', '.join(USUAL)}")
+    return USUAL[: USUAL.index(method) + 1] if settings.is_scored else (method,)
 
 
 def looks_around(methods: Sequence[str]) -> bool:
@@ -117,7 +113,10 @@ def result_of_method(
     cloud, flow, tracks = moments.pop(name)
     seen = _see_window(scene, cloud, visible).with_far_points(far)
     cloud = seen.cloud
-    held_out = _score_held_out(scene, seen, visible)
+    held_out = None
+    if scene.held_out is not None:
+        with watch.stage("held out"):
+            held_out = scene.held_out.scores(seen, visible)
 
     with watch.stage("project"):
         movers = {}
@@ -126,7 +125,7 @@ def result_of_method(
         if output.movers != "keep":
             static = cloud.select(~cloud.moving & ~cloud.far)
             seen = views.see(static).with_far_points(far)
-        depth_maps = _add_ages(scene, method, _make_maps(scene, seen, visible, filled))
+        depth_maps = _make_maps(scene, seen, method, visible, filled)
     cloud = seen.cloud
     if scene.images:
         with watch.stage("colour"):
@@ -134,7 +133,7 @@ def result_of_method(
     if visible:
         cloud = views.with_confidence(seen, cloud, depth_maps)
     with watch.stage("score"):
-        metrics = _score(scene, cloud, depth_maps, visible) | {"held_out": held_out}
+        metrics = _score(scene, cloud, depth_maps, visible, held_out)
     return Result(
         method=name,
         key=scene.key,
@@ -178,77 +177,56 @@ def _see_far(scene: KeyScene, method: Method) -> SeenCloud | None:
         return scene.views.see_far(*scene.far_surfaces, scene.stretch, static_only=method.visible)
 
 
-def _add_ages(
-    scene: KeyScene, method: Method, depth_maps: Mapping[str, DepthMap]
+def _make_maps(
+    scene: KeyScene, seen: SeenCloud, method: Method, visible: bool, filled: bool
 ) -> dict[str, DepthMap]:
-    """Return the maps with the time between the exposure and the source sweep of each pixel."""
-    stamps_ns = {registered.frame: registered.sweep.stamp_ns for registered in scene.stretch.sweeps}
+    """Return the depth maps of the points with ages, limited to ``project.max_outliers``."""
+    stretch, views = scene.stretch, scene.views
+    stamps_ns = {registered.frame: registered.sweep.stamp_ns for registered in stretch.sweeps}
     if method.far and scene.far_surfaces is not None:
         surfaces = scene.far_surfaces.world
         stamps_ns |= zip(surfaces.frames, surfaces.stamp_ns.tolist(), strict=True)
-    exposures = scene.views.exposures
-    return {
-        name: with_ages(depth_map, stamps_ns, scene.key, exposures[name].late_s)
-        for name, depth_map in depth_maps.items()
-    }
+    is_alone = len(stretch.sweeps) == 1
+    untimed_share, period_s = (0.0, 0.0) if is_alone or not visible else _find_untimed(scene)
 
-
-def _make_maps(
-    scene: KeyScene, seen: SeenCloud, visible: bool, filled: bool
-) -> dict[str, DepthMap]:
-    """Return the depth maps of the points, limited to ``project.max_outliers``."""
     depth_maps = dict[str, DepthMap]()
     for name in scene.watch.each("project", seen.in_view):
+        exposure = views.exposures[name]
         of_one_map = seen._replace(in_view={name: seen.in_view[name]})
-        depth_maps |= scene.views.depth_maps(of_one_map, visible, filled)
-    if visible:
-        depth_maps = _lower_confidence(scene, depth_maps)
-    max_outliers = scene.settings.project.max_outliers
-    return {
-        name: with_max_outliers(depth_map, max_outliers) for name, depth_map in depth_maps.items()
-    }
+        depth_map = views.depth_maps(of_one_map, visible, filled)[name]
+        if visible and is_alone:
+            depth_map = without_confirmation(depth_map)
+        elif untimed_share:
+            # Without a time a point is shifted by up to the motion in half a period: forwards,
+            # twist[5].
+            shift_m = 0.5 * period_s * abs(float(exposure.twist[5]))
+            depth_map = without_times(depth_map, shift_m, exposure.camera, untimed_share)
+        depth_map = with_max_outliers(depth_map, scene.settings.project.max_outliers)
+        depth_maps[name] = with_ages(depth_map, stamps_ns, scene.key, exposure.late_s)
+    return depth_maps
 
 
-def _lower_confidence(scene: KeyScene, depth_maps: dict[str, DepthMap]) -> dict[str, DepthMap]:
-    """Return the maps with a lower confidence for a single sweep, and for sweeps without times."""
+def _find_untimed(scene: KeyScene) -> tuple[float, float]:
+    """Return the share of the sweeps that deskewing moves without point times, and the period."""
     sweeps = [registered.sweep for registered in scene.stretch.sweeps]
-    if len(sweeps) == 1:
-        return {name: without_confirmation(depth_map) for name, depth_map in depth_maps.items()}
-    key_sweep = scene.stretch[scene.key]
-    untimed_share = np.mean([sweep.offset_ns is None for sweep in sweeps])
-    if not untimed_share or not scene.settings.register.deskew:
-        return depth_maps
     period_s = float(np.median(np.diff([sweep.stamp_ns for sweep in sweeps]))) * 1e-9
+    share = float(np.mean([sweep.offset_ns is None for sweep in sweeps]))
+    key_sweep = scene.stretch[scene.key]
     # Sweeps already compensated for motion need no point times.
-    if key_sweep.sweep.offset_ns is None and (
+    is_compensated = key_sweep.sweep.offset_ns is None and (
         find_compensated(key_sweep.sweep, key_sweep.twist, period_s) is not None
-    ):
-        return depth_maps
-    # Without a time a point is shifted by up to the motion in half a period: forwards, twist[5].
-    exposures = scene.views.exposures
-    return {
-        name: without_times(
-            depth_map,
-            0.5 * period_s * abs(float(exposures[name].twist[5])),
-            exposures[name].camera,
-            float(untimed_share),
-        )
-        for name, depth_map in depth_maps.items()
-    }
-
-
-def _score_held_out(scene: KeyScene, seen: SeenCloud, visible: bool) -> dict[str, Any] | None:
-    """Return the scores of maps made without the key sweep, None if they are not asked for."""
-    if scene.held_out is None:
-        return None
-    with scene.watch.stage("held out"):
-        return scene.held_out.scores(seen, visible)
+    )
+    return (share if scene.settings.register.deskew and not is_compensated else 0.0), period_s
 
 
 def _score(
-    scene: KeyScene, cloud: Cloud, depth_maps: Mapping[str, DepthMap], visible: bool
+    scene: KeyScene,
+    cloud: Cloud,
+    depth_maps: Mapping[str, DepthMap],
+    visible: bool,
+    held_out: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return the scores that need no ground truth, and depth scores if ground truth is given."""
+    """Return the scores, those of depth if there is ground truth; ``held_out`` are known."""
     metrics: dict[str, Any] = {
         "num_points": len(cloud),
         "num_moving": int(cloud.moving.sum()),
@@ -276,35 +254,24 @@ def _score(
             name: expected_outliers(depth_map) for name, depth_map in depth_maps.items()
         }
     metrics["measure"] = {name: depth_map.measure for name, depth_map in depth_maps.items()}
-    metrics["held_out"] = None  # keeps the order of the file; the caller sets it
+    metrics["held_out"] = held_out
     if scene.settings.output.rejected:
         metrics["rejected"] = {name: depth_map.counts() for name, depth_map in depth_maps.items()}
     return metrics
 
 
 def complete_with_prior(
-    result: Result,
-    files: PriorFiles,
-    shots: Mapping[str, Shot],
-    truth: Mapping[str, tuple[Float32, Bool]],
-    kind: str,
+    scene: KeyScene, result: Result, files: PriorFiles, shots: Mapping[str, Shot]
 ) -> Result:
     """Return the result with completed maps (``full``) and their scores.
 
-    A prior that does not fit the measured depth is not used, and a warning is logged.
-
-    Args:
-        shots: Map name -> image that the map shows.
-        truth: Map name -> ground-truth depth (H,W) in metres and mask (H,W) of moving pixels.
-        kind: The setting ``prior.kind``.
-
-    Raises:
-        InputError: The prior has no depth image for any map of the key.
+    A prior that does not fit the measured depth is not used, and a warning is logged. ``shots`` are
+    by map name. Raise InputError if the prior has no depth image for any map of the key.
     """
     full = {}
     metrics = copy.deepcopy(dict(result.metrics))
     for name, prior in _read_priors(files, shots, result.key).items():
-        completed = complete(result.depth[name], prior, kind)
+        completed = complete(result.depth[name], prior, scene.settings.prior.kind)
         full[name] = completed
         if not completed.fit.used:
             _log.warning(
@@ -319,9 +286,9 @@ def complete_with_prior(
         prior_alone_m = np.where(completed.from_prior, completed.depth_m, np.float32(0))
         for product, depth_m in (("full", completed.depth_m), ("prior", prior_alone_m)):
             metrics["density"][name][product] = depth_metrics.image_density(depth_m)
-            if name in truth:
+            if name in scene.truth:
                 metrics["depth"][name][product] = depth_metrics.scores_by_motion(
-                    depth_m, *truth[name], shots[name].camera
+                    depth_m, *scene.truth[name], shots[name].camera
                 )
     return replace(result, full=full, metrics=metrics)
 

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import wraps
-from typing import Any, Concatenate, NamedTuple, ParamSpec, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -49,44 +49,28 @@ from densify.pipeline.accumulate import accumulate, object_tracks
 from densify.pipeline.process import Watch
 from densify.pipeline.road import Road, choose_views
 from densify.pipeline.sweeps import Cut, Sweeps
-from densify.readers.timeline import (
-    Timeline,
-    WindowFrames,
-    format_frames,
-    recorded_trajectory,
-)
+from densify.readers.timeline import Timeline, WindowFrames, format_frames, recorded_trajectory
 from densify.registration.deskew import deskew
 from densify.registration.trajectory import LeftOut, Registration, find_trajectory
 
 T = TypeVar("T")
-P = ParamSpec("P")
 # Time before a block, in which odometry converges to the vehicle's motion, and its least number of
 # sweeps, which show the speed
 _LEAD_IN_S, _MIN_LEAD_IN = 0.5, 2
 _STRIDE = 8  # every eighth point is enough for the share of points below the ground
 
 
-def _latest(
-    method: Callable[Concatenate[Recording, P], T],
-) -> Callable[Concatenate[Recording, P], T]:
+def _latest(method: Callable[..., T]) -> Callable[..., T]:
     """Keep the result of a method's latest call in memory, for calls with equal arguments."""
 
     @wraps(method)
-    def call(recording: Recording, *args: P.args, **kwargs: P.kwargs) -> T:
-        latest = recording._results.get(method.__name__)
-        if latest is None or latest.arguments != args:
-            latest = _Latest(args, method(recording, *args, **kwargs))
-            recording._results[method.__name__] = latest
-        return cast(T, latest.result)
+    def call(recording: Recording, *args: Any) -> T:
+        latest = recording._latest.get(method.__name__)
+        if latest is None or latest[0] != args:
+            latest = recording._latest[method.__name__] = args, method(recording, *args)
+        return cast(T, latest[1])
 
     return call
-
-
-class _Latest(NamedTuple):
-    """The latest call of a method."""
-
-    arguments: tuple[Any, ...]
-    result: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +83,8 @@ class Piece:
     # the piece: the levelled lidar frame of the first of ``frames``
     poses: Trajectory
     frames: tuple[int, ...]  # frame numbers of the piece's sweeps
-    deskewed: dict[int, RegisteredSweep]  # by frame, those that were needed until now
-
-    def pose(self, frame: int) -> Float:
-        """Return the pose ``T_world_lidar`` (4,4) of a sweep in the world of the piece."""
-        pose: Float = self.poses.T_world_lidar[self.poses.frames.index(frame)]
-        return pose
+    # By frame, those that were needed until now
+    deskewed: dict[int, RegisteredSweep] = field(default_factory=dict)
 
 
 class Moment(NamedTuple):
@@ -156,12 +136,12 @@ class Recording:
         self._watch = watch or Watch()
         self._cache = cache
         self._run = run
-        self._results: dict[str, _Latest] = {}  # latest call of each method with `_latest`
+        self._latest: dict[str, tuple[Any, Any]] = {}  # method -> arguments, result
 
         keys = timeline.frames if keys is None else keys
         Cut.of(timeline, window, keys)  # raises for a bad key or window before a sweep is read
         looks_around &= engine_row(settings.flow.engine)[0].shared
-        around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
+        around_s, step_s = self._look_around(keys if looks_around else ())
         self.cut = Cut.of(timeline, window, keys, around_s)
         # Around the windows motion is searched in every n-th sweep.
         self._step_around = max(1, timeline.num_in(step_s))
@@ -175,10 +155,8 @@ class Recording:
 
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
         """Return the seconds around windows where motion is searched, and between its sweeps."""
-        if not keys or self.settings.flow.look_around_s == 0:
-            return 0.0, 0.0
         # The first readable key shows the number of points per second.
-        for key in sorted(keys):
+        for key in sorted(keys) if self.settings.flow.look_around_s != 0 else ():
             with suppress(InputError):  # raised again where the key is made
                 num_points = len(self.sequence[key])
                 return self.settings.flow.around(num_points / (self.timeline.period_ns * 1e-9))
@@ -192,31 +170,23 @@ class Recording:
             InputError: The key's sweep cannot be read.
         """
         requested = self.timeline.window(key, self._num_beside)
-        block_index = self.cut.number_of[key]
-        block = self.cut.blocks[block_index]
-        left_out = {
-            frame: cause
-            for frame, cause in self.registration(block_index).left_out.items()
-            if frame in block
-        }
+        left_out = self.registration(self.cut.number_of[key]).left_out
         if key in left_out:
             raise left_out[key].error(key)
 
         # The window ends before a sweep that is left out, and at the end of the key's piece.
         reasons = {frame: cause.reason for frame, cause in left_out.items()}
         usable = self.timeline.window(key, self._num_beside, reasons)
-        in_piece = frozenset(self._piece(key).poses.frames)
-        window = WindowFrames(
-            tuple(frame for frame in usable.frames if frame in in_piece), usable.cuts
-        )
+        in_piece = self._piece(key).poses.frames
+        frames = tuple(frame for frame in usable.frames if frame in in_piece)
 
         # The key is alone because a neighbour failed to register. An unreadable neighbour is no
         # error: the recording may have lost it, and the key's own sweep gives a result.
-        if len(window.frames) == 1:
+        if len(frames) == 1:
             for frame in requested.frames:
                 if frame in left_out and not left_out[frame].unreadable:
                     raise left_out[frame].error(frame)
-        return window
+        return WindowFrames(frames, usable.cuts)
 
     def window(self, key: int) -> Stretch:
         """Return the registered, deskewed sweeps of a key's window; raise as `window_frames`."""
@@ -241,8 +211,7 @@ class Recording:
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
         if not engine_row(engine)[0].shared:
-            scene = Scene(window, self._ground(piece))
-            return estimate_motion(scene, self.settings, engine)
+            return estimate_motion(Scene(window, self._ground(piece)), self.settings, engine)
         # The poses of all searched sweeps, but points only for those of the window
         in_window = {registered.frame: registered for registered in window.sweeps}
         sweeps = [
@@ -256,11 +225,8 @@ class Recording:
         window = self.window(frame)
         later = [other for other in window.frames if other > frame]
         earlier = [other for other in window.frames if other < frame]
-        targets = later or earlier
-        if not targets:
-            return StretchFlow(window, {})
-        source_target = (frame, targets[0])
-        return StretchFlow(window, {source_target: self.motion(frame).flow(*source_target)})
+        steps = [(frame, target) for target in (later or earlier)[:1]]
+        return StretchFlow(window, {step: self.motion(frame).flow(*step) for step in steps})
 
     def moment(
         self, key: int, all_sweeps: bool, engine: str | None, with_flow: bool = False
@@ -311,7 +277,8 @@ class Recording:
             return None
         piece = self._piece(key)
         surfaces = self._far(piece)
-        return FarSurfaces(surfaces, poses.inverse(piece.pose(key))) if surfaces.frames else None
+        T_world_key = self._stretch(piece, [key])[key].T_world_lidar
+        return FarSurfaces(surfaces, poses.inverse(T_world_key)) if surfaces.frames else None
 
     def _piece(self, key: int) -> Piece:
         """Return the piece that holds the key sweep."""
@@ -324,8 +291,16 @@ class Recording:
         frames = self._frames_with_lead_in(number)
 
         def make() -> Registration:
+            sweeps: dict[int, Sweep] = {}
+            left_out: dict[int, LeftOut] = {}
             self.sweeps.prepare(frames)
-            sweeps, left_out = self._read_usable(frames)
+            for frame in self._watch.each("read", frames):
+                try:
+                    self.sweeps.recorded_pose(frame)  # raises if the recording lacks the pose
+                    sweeps[frame] = self.sweeps.read(frame)
+                except InputError as error:
+                    left_out[frame] = LeftOut(str(error), unreadable=True)
+
             pieces = []
             remaining = self.timeline.split_at_holes(sweeps)
             while remaining:
@@ -343,18 +318,6 @@ class Recording:
 
         return self._cached("registration", frames, make)
 
-    def _read_usable(self, frames: Sequence[int]) -> tuple[dict[int, Sweep], dict[int, LeftOut]]:
-        """Return the sweeps that can be read, and the causes why others are left out, by frame."""
-        sweeps: dict[int, Sweep] = {}
-        left_out: dict[int, LeftOut] = {}
-        for frame in self._watch.each("read", frames):
-            try:
-                self.sweeps.recorded_pose(frame)  # raises if the recording lacks the pose
-                sweeps[frame] = self.sweeps.read(frame)
-            except InputError as error:
-                left_out[frame] = LeftOut(str(error), unreadable=True)
-        return sweeps, left_out
-
     def _register(self, sweeps: Sequence[Sweep]) -> Trajectory:
         """Return the poses of consecutive sweeps; raise InputError if they are in a map's frame."""
         settings = self.settings.register
@@ -366,9 +329,8 @@ class Recording:
         if symptom:
             ends = format_frames([sweeps[0].frame, sweeps[-1].frame])
             raise InputError(
-                f"{self.sequence.name}: sweeps {ends} are in the "
-                f"frame of a map: {symptom}; expected each in its scanner's own frame: "
-                f"{MAP_FRAME_REMEDY}"
+                f"{self.sequence.name}: sweeps {ends} are in the frame of a map: {symptom}; "
+                f"expected each in its scanner's own frame: {MAP_FRAME_REMEDY}"
             )
         return trajectory
 
@@ -389,7 +351,7 @@ class Recording:
             if frames:
                 part = [frame for frame in trajectory.frames if frame in with_pose]
                 piece_poses = trajectory.part(part, origin=frames[0])
-                pieces.append(Piece(number, len(pieces), piece_poses, frames, {}))
+                pieces.append(Piece(number, len(pieces), piece_poses, frames))
         return pieces
 
     def _stretch(self, piece: Piece, frames: Sequence[int]) -> Stretch:
@@ -431,8 +393,7 @@ class Recording:
             stretch = self._stretch(piece, frames)
             heights = self._ground(piece)
             with self._watch.stage("flow"):
-                scene = Scene(stretch, heights, asked=asked)
-                motion = estimate_motion(scene, self.settings, engine)
+                motion = estimate_motion(Scene(stretch, heights, asked), self.settings, engine)
             return cast(SharedMotion, motion).with_stretch(Stretch(()))
 
         settings = [engine, self.settings.flow, self.settings.objective, sorted(asked), piece.row]

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -58,19 +58,8 @@ class _RoadSweep(NamedTuple):
         """Return the returns in view of a camera, deskewed."""
         if self.in_window:
             return self.registered
-        return deskew_sweep(
-            self.registered.sweep,
-            self.registered.T_world_lidar,
-            self.registered.twist_before,
-            self.registered.twist_after,
-        )
-
-
-class _RelaxedRoad(NamedTuple):
-    """The sweeps along the road with corrected poses."""
-
-    sweeps: list[_RoadSweep]
-    unreliable: frozenset[int]  # frames of the sweeps whose poses stay unreliable
+        raw = self.registered
+        return deskew_sweep(raw.sweep, raw.T_world_lidar, raw.twist_before, raw.twist_after)
 
 
 @dataclass(frozen=True)
@@ -100,18 +89,18 @@ class Road:
         numbers = count(1)  # of the sweeps of both sides, for the progress
         with ThreadPoolExecutor(num_threads()) as pool:
             sweeps_before, sweeps_after = pool.map(partial(self._collect_side, numbers), (-1, 1))
-        road = _RelaxedRoad([*sweeps_before[::-1], *window_sweeps, *sweeps_after], frozenset())
+        road_sweeps = [*sweeps_before[::-1], *window_sweeps, *sweeps_after]
         # Odometry drifts along the road, recorded poses do not.
-        has_odometry = bool(self._surfaces)
-        if has_odometry and len(road.sweeps) > 1:
-            road = self._relax(road.sweeps)
+        left_out: tuple[int, ...] = ()
+        if self._surfaces and len(road_sweeps) > 1:
+            road_sweeps, left_out = self._relax(road_sweeps)
 
         # Keep the points of each sweep that no other sweep saw through.
         used = [
             road_sweep
-            for road_sweep in road.sweeps
+            for road_sweep in road_sweeps
             if (with_window or not road_sweep.in_window)
-            and road_sweep.registered.frame not in road.unreliable
+            and road_sweep.registered.frame not in left_out
         ]
         travel_m = np.array([road_sweep.travel_m for road_sweep in used])
         static_points = partial(far.static_points, Sensors.of(self.window.sweeps))
@@ -119,7 +108,6 @@ class Road:
             deskewed = list(pool.map(_RoadSweep.deskewed, used))
             is_seen_through = far.find_seen_through(deskewed, travel_m)
             static_surfaces = list(pool.map(static_points, deskewed, is_seen_through))
-        left_out = tuple(sorted(road.unreliable))
         return replace(far.join_worlds(static_surfaces), left_out=left_out)
 
     @cached_property
@@ -222,12 +210,12 @@ class Road:
         from_window_m = last_used_m = 0.0  # travel as in `_collect_side`
         T_world_last = end_of_window.T_world_lidar
         last_ns = end_of_window.sweep.stamp_ns
+        recorded_pose = cast(Callable[[int], Float], self.sweeps.recorded_pose)
         try:
             # The recording has a world of its own.
-            recorded_pose = self._recorded_pose(end_of_window.frame)
-            T_world_recorded = T_world_last @ poses.inverse(recorded_pose)
+            T_world_recorded = T_world_last @ poses.inverse(recorded_pose(end_of_window.frame))
             for frame in frames:
-                T_world_lidar = T_world_recorded @ self._recorded_pose(frame)
+                T_world_lidar = T_world_recorded @ recorded_pose(frame)
                 stamp_ns = self.timeline.stamp_of(frame)
                 # Back in time both motion and seconds are reversed: the velocity is the same.
                 seconds = (stamp_ns - last_ns) * 1e-9
@@ -245,12 +233,11 @@ class Road:
         except InputError:  # the road ends without a pose or a sweep
             return
 
-    def _recorded_pose(self, frame: int) -> Float:
-        """Return the recorded ``T_world_lidar`` (4,4) of a sweep; raise InputError without one."""
-        return cast(Float, self.sweeps.recorded_pose(frame))  # None only without recorded poses
+    def _relax(self, road_sweeps: Sequence[_RoadSweep]) -> tuple[list[_RoadSweep], tuple[int, ...]]:
+        """Return the sweeps with poses corrected by `relax_poses`, and the unreliable frames.
 
-    def _relax(self, road_sweeps: Sequence[_RoadSweep]) -> _RelaxedRoad:
-        """Return the sweeps with poses corrected by `relax_poses`; those of the window stay."""
+        The poses of the window stay.
+        """
         frames = tuple(road_sweep.registered.frame for road_sweep in road_sweeps)
         num_points = float(np.median([len(registered.sweep) for registered in self.window.sweeps]))
         relaxed = relax_poses(
@@ -260,8 +247,7 @@ class Road:
             num_in_submap(num_points),
         )
         stamps_ns = [road_sweep.registered.sweep.stamp_ns for road_sweep in road_sweeps]
-        stamp_ns = np.array(stamps_ns, np.int64)
-        trajectory = Trajectory(frames, stamp_ns, relaxed.T_world_lidar)
+        trajectory = Trajectory(frames, np.array(stamps_ns, np.int64), relaxed.T_world_lidar)
 
         # The twists that deskew a sweep follow from the corrected poses around it.
         corrected = list(road_sweeps)
@@ -271,7 +257,7 @@ class Road:
                 registered = RegisteredSweep(sweep, T_world_lidar, *twists(trajectory, i))
                 corrected[i] = road_sweep._replace(registered=registered)
         unreliable = np.array(frames)[~relaxed.is_reliable].tolist()
-        return _RelaxedRoad(corrected, frozenset(unreliable))
+        return corrected, tuple(sorted(unreliable))
 
     def _select_in_view(self, registered: RegisteredSweep) -> RegisteredSweep:
         """Return a sweep with only those returns that one of the views may see."""

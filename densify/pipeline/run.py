@@ -1,15 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Run the pipeline.
-
-`densify` is all of it for one key::
-
-    register and deskew the window     recording.window
-    accumulate rigidly, or with flow   recording.moment   (free space, ground, motion)
-    find static surfaces beyond it     recording.find_far_surfaces
-    see, project, fill, score          densify.pipeline.key_result, method by method
-    complete with a prior              densify.pipeline.key_result
-    warn                               densify.pipeline.warnings
-"""
+"""Run the pipeline. `densify` tells all of it, step by step, for one key."""
 
 from __future__ import annotations
 
@@ -19,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +22,10 @@ from densify.depth.views import HeldOut, Views
 from densify.flow.engines import check_engine
 from densify.free_space.range_image import RangeImage
 from densify.geometry.compiled import num_threads
-from densify.geometry.types import (
-    Cloud,
-    LidarSequence,
-    Progress,
-    Result,
-    StretchFlow,
-)
+from densify.geometry.types import Cloud, LidarSequence, Progress, Result, StretchFlow
 from densify.pipeline.key_result import (
-    COMPARED,
     METHODS,
+    USUAL,
     KeyScene,
     complete_with_prior,
     looks_around,
@@ -51,10 +35,8 @@ from densify.pipeline.key_result import (
 from densify.pipeline.process import Watch
 from densify.pipeline.recording import FarSurfaces, Recording
 from densify.pipeline.warnings import add_warnings
+from densify.readers.prior_files import PriorFiles
 from densify.readers.timeline import choose_cameras
-
-if TYPE_CHECKING:
-    from densify.readers.prior_files import PriorFiles
 
 T = TypeVar("T")
 ConfigLike = Config | str | Path | Mapping[str, Any] | None
@@ -128,7 +110,7 @@ def compare(
     cameras: Sequence[str] | None = None,
     config: ConfigLike = None,
     progress: Progress | None = None,
-    methods: Sequence[str] = COMPARED,
+    methods: Sequence[str] = USUAL,
     cache: Cache | None = None,
     prior: str | Path | None = None,
 ) -> dict[str, Result]:
@@ -198,16 +180,18 @@ def densify(
         priors: Depth images that complete the maps of the last method.
     """
     methods = tuple(dict.fromkeys(methods))  # each once, in order
-    sequence = recording.sequence
-    settings = recording.settings
+    sequence, settings = recording.sequence, recording.settings
     watch = watch or Watch()
     watch.restart()
-    recording.window(key)  # raises its errors before an image is read
+
+    # Register and deskew the window. Its errors are raised before an image is read.
+    recording.window(key)
     shots = key_shots(sequence, choose_cameras(sequence, cameras), key, settings.project)
     with watch.stage("images"):
         images = load_images(sequence, shots)
 
     with ThreadPoolExecutor(num_threads()) as pool:
+        # Accumulate the window, rigidly or with flow. Meanwhile find static surfaces beyond it.
         wants_far = any(METHODS[name].far for name in methods)
         future = pool.submit(recording.find_far_surfaces, key) if wants_far else None
         with_flow = settings.output.flow != "none"
@@ -218,34 +202,27 @@ def densify(
         far_surfaces = None if future is None else future.result()
         if key == max(recording.cut.number_of):  # no later key needs them
             recording.sweeps.read.cache_clear()
+
+        # See, project, fill and score the points, method by method.
         cloud = moments[methods[-1]].cloud
         scene = scene_of(recording, key, shots, images, far_surfaces, cloud, with_images, watch)
         del cloud  # its method replaces it, and must not hold both
         are_filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene, moments)
-        results_alone = list(pool.map(make, methods, are_filled))
+        results = list(pool.map(make, methods, are_filled))
 
     if priors is not None:
         with watch.stage("prior"):
-            results_alone[-1] = complete_with_prior(
-                results_alone[-1], priors, shots, scene.truth, settings.prior.kind
-            )
-    results = _with_baselines(results_alone, watch, sequence.name)
-    return add_warnings(results, recording, key, shots)
+            results[-1] = complete_with_prior(scene, results[-1], priors, shots)
+    return add_warnings(_with_baselines(results, watch, sequence.name), recording, key, shots)
 
 
 def _with_baselines(results: Sequence[Result], watch: Watch, recording: str) -> dict[str, Result]:
     """Return method -> result, each with the results before it as baselines."""
+    common = partial(replace, costs=watch.costs(), elapsed_s=watch.elapsed_s(), recording=recording)
     by_method: dict[str, Result] = {}
-    costs, elapsed_s = watch.costs(), watch.elapsed_s()
     for result in results:
-        by_method[result.method] = replace(
-            result,
-            costs=costs,
-            elapsed_s=elapsed_s,
-            baselines=dict(by_method),
-            recording=recording,
-        )
+        by_method[result.method] = common(result, baselines=dict(by_method))
     return by_method
 
 
@@ -264,8 +241,7 @@ def scene_of(
     ``shots`` and ``images`` (H,W,3) are by map name. ``cloud`` says which points of the key sweep
     move.
     """
-    sequence = recording.sequence
-    settings = recording.settings
+    sequence, settings = recording.sequence, recording.settings
     stretch = recording.window(key)
     key_image = RangeImage.of(stretch[key])
     views = Views.of(sequence, stretch, key, shots, images, settings)
@@ -294,8 +270,6 @@ def _open_prior(
     """Return the depth images in the folder ``prior``, None without one."""
     if prior is None:
         return None
-    from densify.readers.prior_files import PriorFiles
-
     names = [camera.name for camera in choose_cameras(sequence, cameras)]
     return PriorFiles.open(Path(prior), names)
 

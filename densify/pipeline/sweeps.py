@@ -14,7 +14,7 @@ from densify.config.errors import InputError
 from densify.free_space.raw_sweeps import count_by_azimuth
 from densify.geometry.types import Float, Int, LidarSequence, Sweep
 from densify.pipeline.process import Watch
-from densify.readers.timeline import Timeline, check_key, check_window, read_sweep
+from densify.readers.timeline import Timeline, check_key, read_sweep
 
 _RENDERED_TOGETHER = 4  # sweeps of the street between two reports of progress
 BLOCK_S = 2.0
@@ -34,13 +34,9 @@ class Sweeps:
         run: str | None,
         watch: Watch,
     ) -> None:
-        """Prepare to read.
+        """Prepare to read. ``num_kept`` sweeps are kept in memory.
 
-        Args:
-            num_kept: Number of sweeps kept in memory.
-            cache: Cache on disk, None for no cache.
-            run: Name of a run whose processes share digests of sweeps; None for no sharing.
-            watch: Measures the stage ``read``.
+        Processes of one ``run`` share the digests of sweeps through the cache on disk.
         """
         self._sequence = sequence
         self._timeline = timeline
@@ -123,7 +119,6 @@ class Cut:
         Raises:
             InputError: The window or a key is invalid, or a key does not exist.
         """
-        check_window(window)
         for key in keys:
             check_key(key)
         groups = _group_keys(timeline, window, sorted(set(keys)))

@@ -31,10 +31,7 @@ _MAX_NEAR, _MAX_BELOW, _MAX_MOVING = 0.2, 0.0025, 1 / 3
 
 
 def add_warnings(
-    results: Mapping[str, Result],
-    recording: Recording,
-    key: int,
-    shots: Mapping[str, Shot],
+    results: Mapping[str, Result], recording: Recording, key: int, shots: Mapping[str, Shot]
 ) -> dict[str, Result]:
     """Return the ``results`` of one key, by method, with the field ``warnings`` filled in."""
     sequence = recording.sequence
@@ -49,7 +46,6 @@ def add_warnings(
             if name not in cameras and not sequence.image_stamps_ns(name)
         ),
         *_warn_of_sweeps(recording, key),
-        *_warn_of_sectors(stretch, recording),
         *_warn_of_motion(recording, key),
         *_warn_of_images(sequence, shots),
     ]
@@ -90,7 +86,8 @@ def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"{100 * share:.0f} % of the points are lone returns, as of snow, rain or dust; they "
             f"are left out, and motion is less certain"
         )
-    share_near = _share_near(sweeps)
+    num_near = sum(sweep.num_near for sweep in sweeps)
+    share_near = num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
     if share_near > _MAX_NEAR:
         yield (
             f"register.min_range_m = {settings.register.min_range_m:g} takes "
@@ -103,6 +100,8 @@ def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"{100 * share_below:.1f} % of the points lie below the ground, as mirror images of a "
             f"wet road and echoes over two surfaces do; they are left out"
         )
+    if share_near <= _MAX_NEAR:  # else sweeps may lack the returns of the own vehicle
+        yield from _warn_of_sectors(recording, [sweep.frame for sweep in sweeps])
 
 
 def _warn_of_silent_scanners(sweeps: Sequence[Sweep]) -> Iterator[str]:
@@ -116,18 +115,10 @@ def _warn_of_silent_scanners(sweeps: Sequence[Sweep]) -> Iterator[str]:
             )
 
 
-def _share_near(sweeps: Sequence[Sweep]) -> float:
-    """Return the share of the returns that are left out as the own vehicle's."""
-    num_near = sum(sweep.num_near for sweep in sweeps)
-    return num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
-
-
-def _warn_of_sectors(stretch: Stretch, recording: Recording) -> Iterator[str]:
+def _warn_of_sectors(recording: Recording, frames: Sequence[int]) -> Iterator[str]:
     """Yield warnings about directions in which raw sweeps lack returns."""
-    if _share_near([registered.sweep for registered in stretch.sweeps]) > _MAX_NEAR:
-        return  # they may lack the returns that are left out as the own vehicle's
-    returns = np.stack([recording.sweeps.returns_by_azimuth(frame) for frame in stretch.frames])
-    widths_deg = zip(stretch.frames, lost_deg(returns), strict=True)
+    returns = np.stack([recording.sweeps.returns_by_azimuth(frame) for frame in frames])
+    widths_deg = zip(frames, lost_deg(returns), strict=True)
     lacking_deg = {frame: width for frame, width in widths_deg if width >= LOST_DEG}
     if lacking_deg:
         widest_deg = max(lacking_deg.values())
