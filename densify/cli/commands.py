@@ -316,7 +316,7 @@ train a network that completes depth on several kinds of maps, and test each
 --sets NAME,…  some of both, streets, KITTI, PandaSet (default: all)
 --maps NAME,…  some of the kinds of maps (default: all)
 --seeds N =5  networks of each set and kind of maps
---network {small,large} =small  0.24 million weights, or 1.2 million, for a GPU
+--network {{small,large}} =small  0.24 million weights, or 1.2 million, for a GPU
 --steps N  training steps of each network (default: 300; large: 1500)
 --image-alone  train on the image alone (monocular depth)
 --device {{auto,cpu,cuda}} =auto  device to train on
