@@ -18,7 +18,6 @@ from densify.depth.exposure import key_shots
 from densify.geometry.types import Float32, LidarSequence
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_jpeg
-from densify.outputs.kitti_tree import FileRecord
 from densify.outputs.plots import depth_over_image, order_front_first
 from densify.readers import open_sequence
 
@@ -74,8 +73,8 @@ def draw_depth(depth_m: Float32, image: Picture | None) -> Picture:
     return np.ascontiguousarray(depth_over_image(below, depth_m)[:, :, ::-1])
 
 
-def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> dict[str, FileRecord]:
-    """Write the picture of a key whose maps are not kept; return its path and its record.
+def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> Path:
+    """Write the picture of a key whose maps are not kept, and return its path.
 
     Args:
         out: Folder of the training set.
@@ -85,7 +84,6 @@ def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> dict[s
     """
     small_m = shrink(filled_m)
     picture = draw_depth(small_m, small_image(drive, key, small_m.shape[::-1]))
-    name, data = f"{PICTURE_FOLDER}/{drive.name}/{key:010d}.jpg", encode_jpeg(picture, _QUALITY)
-    (out / name).parent.mkdir(parents=True, exist_ok=True)
-    write_file(out / name, data)
-    return {name: FileRecord.of(data)}
+    path = out / PICTURE_FOLDER / drive.name / f"{key:010d}.jpg"
+    write_file(path, encode_jpeg(picture, _QUALITY))
+    return path

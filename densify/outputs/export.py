@@ -33,8 +33,7 @@ class Export:
     """The written files, and the pixels and points within the thresholds."""
 
     paths: list[Path]  # paths of the files
-    # Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for formats with
-    # maps
+    # Camera -> ``measured``, ``filled`` -> share of the pixels with a depth, for formats with maps
     density: Mapping[str, Mapping[str, Kept]]
     num_points: Kept | None = None  # number of points, for formats with a cloud
 
@@ -80,7 +79,9 @@ def export_run(
     write = getattr(module, f"write_{to.replace('-', '_')}")
     with writing(folder, (*form.owned, _RECORD), folder, overwrite) as staging:
         write(runs if form.of_drive else runs[0], staging)
-        export = Export([], runs[0].density if len(runs) == 1 else {}, _total(runs))
+        counts = [run.num_points for run in runs if run.num_points is not None]
+        num_points = Kept(*map(sum, zip(*counts, strict=True))) if counts else None
+        export = Export([], runs[0].density if len(runs) == 1 else {}, num_points)
         record = {
             "run": str(run),
             "to": to,
@@ -103,14 +104,6 @@ def facts(export: Export) -> dict[str, Any]:
     num_points = export.num_points and export.num_points._asdict()
     values = {"density": density, "num_points": num_points}
     return {name: value for name, value in values.items() if value}
-
-
-def _total(runs: Sequence[FinishedRun]) -> Kept | None:
-    """Return the number of points in all clouds that were read, None if none was read."""
-    counts = [run.num_points for run in runs if run.num_points is not None]
-    if not counts:
-        return None
-    return Kept(sum(kept.before for kept in counts), sum(kept.after for kept in counts))
 
 
 def write_npy(run: FinishedRun, folder: Path) -> None:

@@ -230,7 +230,7 @@ def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int,
 
 def _save_path(path: Path, track: PoseTrack, stamps_ns: Int, numbers: Sequence[int]) -> None:
     """Write the poses of a track at (n,) times, each with its number, as PLY."""
-    T = np.stack([track.at(int(ns)) for ns in stamps_ns]) if len(stamps_ns) else np.zeros((0, 4, 4))
+    T = np.array([track.at(int(ns)) for ns in stamps_ns]).reshape(-1, 4, 4)
     quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat().T if len(T) else np.zeros((4, 0))
     columns = dict(zip("xyz", T[:, :3, 3].T, strict=True))
     for names in (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w")):
