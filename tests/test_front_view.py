@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 
 from densify.cli.runs import _front_first
 from densify.geometry.types import CameraView
-from densify.outputs import plots
 from densify.outputs.plots import order_front_first
 from densify.outputs.report_page import KeyFiles, key_page
 from tests.exported import camera_of, write_views
@@ -48,17 +46,10 @@ def test_travel_decides_or_at_rest_the_name(names, poses, expected) -> None:
     assert order_front_first(names, VIEWS, poses) == expected
 
 
-def test_figure_page_and_screen_begin_with_it(tmp_path: Path, monkeypatch) -> None:
-    titles: list[str] = []
-    draw = plots.draw_figure
-    monkeypatch.setattr(plots, "draw_figure", lambda i, p: titles.extend(p) or draw(i, p))
+def test_the_page_and_the_screen_begin_with_it(tmp_path: Path) -> None:
     lenses = dict.fromkeys(NAMES, "plain")
     run, result = write_views(tmp_path, lenses, views=VIEWS, T_key_lidar=travel(5, 0))
-    assert [title.partition(":")[0] for title in titles] == ["scene flow, straight"]
     page = key_page(KeyFiles.of_run(run), "").decode()
     assert re.search(r'"cameras":\s*{\s*"straight":', page)
     paths = [run / "depth_filled" / f"{name}.png" for name in NAMES]
     assert _front_first(paths, result)[0] == paths[2]
-    one = replace(result, depth={"back": result.depth["back"]})
-    plots.write_figure(tmp_path / "one.png", {"flow": one})
-    assert titles[-1].startswith("scene flow: ")
