@@ -34,7 +34,6 @@ from densify.dataset.manifest import (
     finished,
     read_manifests,
 )
-from densify.dataset.pictures import FILLED, find_map, front_camera, keep_picture
 from densify.dataset.plan import (
     Drive,
     Recipe,
@@ -44,6 +43,7 @@ from densify.dataset.plan import (
     read_plan,
     write_plan,
 )
+from densify.dataset.report import FILLED, find_map, front_camera, keep_picture
 from densify.flow.engines import check_engine
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Result

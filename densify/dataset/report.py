@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Write HTML pages: ``report.html`` of a run or training set, ``compare.html`` of a comparison."""
+"""Write HTML pages: ``report.html`` of a run or training set, ``compare.html`` of a comparison.
+
+A training set also keeps a picture of each key that is put aside.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,16 @@ import base64
 import html
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import repeat
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+import cv2
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.dataset.manifest import (
@@ -24,28 +30,25 @@ from densify.dataset.manifest import (
     describe_rest,
     read_manifests,
 )
-from densify.dataset.pictures import (
-    FILLED,
-    PICTURE_FOLDER,
-    draw_depth,
-    find_map,
-    front_camera,
-    shrink,
-    small_image,
-)
 from densify.dataset.plan import Drive, drives_of, planned_keys, read_plan
-from densify.geometry.types import METHOD_NAMES
+from densify.depth.exposure import key_shots
+from densify.geometry.types import METHOD_NAMES, Float32, LidarSequence
 from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_jpeg, metres, read_stored
-from densify.outputs.plots import Dot, score_plot
+from densify.outputs.plots import Dot, depth_over_image, order_front_first, score_plot
 from densify.outputs.report_page import KeyFiles, fill_template, key_page
+from densify.readers import open_sequence
 
+FILLED = ("depth_filled", "groundtruth_filled")
+"""Folders of the maps of filled depth, in the two layouts."""
+_ASIDE = "aside"  # folder of the pictures of keys that are put aside, in a training set
+_WIDTH_PX = 400
+_QUALITY = 80
 _PAGES = {"run.yaml": "report.html", "compare.json": "compare.html"}  # of a key, by its record
 _NUM_WORST, _NUM_SPREAD = 6, 18  # keys with pictures: the worst, and others spread over the set
 _NUM_ASIDE = 12  # keys with pictures among those put aside
 _NUM_LISTED = 1000  # rows of the table of keys, the worst first
 _NUM_DOTS = 1000  # of a plot, half of them the worst keys
-_QUALITY = 80
 _LEAST_GRAY = 40  # of confidence 0; black is no depth
 _MANY_ASIDE = 0.1  # a greater share of keys put aside or failed is reported in the verdict
 # Limit of the recipe -> factor of its unit, and when a key is not kept
@@ -291,17 +294,17 @@ def _pictures(made: _Set, record: KeyRecord, name: str) -> Iterator[str]:
     camera = front_camera(drive)
     depth = find_map(record, FILLED, camera)
     confidence = find_map(record, ("confidence",), camera)
-    kept = next((n for n in record.files if n.startswith(f"{PICTURE_FOLDER}/")), None)
+    kept = next((n for n in record.files if n.startswith(f"{_ASIDE}/")), None)
     if depth is not None:
-        small_m = metres(shrink(read_stored(made.root / depth, np.uint16, "a depth map")))
-        image = small_image(drive, record.key, small_m.shape[::-1])
+        small_m = metres(_shrink(read_stored(made.root / depth, np.uint16, "a depth map")))
+        image = _small_image(drive, record.key, small_m.shape[::-1])
         if image is not None:
             yield _image(image, f"image {camera}, {name}")
-        yield _image(draw_depth(small_m, image), f"filled depth, {name}")
+        yield _image(_draw_depth(small_m, image), f"filled depth, {name}")
     elif kept is not None:
         yield _embedded((made.root / kept).read_bytes(), f"filled depth, {name}")
     if confidence is not None:
-        stored = shrink(read_stored(made.root / confidence, np.uint8, "a map of confidence"))
+        stored = _shrink(read_stored(made.root / confidence, np.uint8, "a map of confidence"))
         # Black without depth, white at confidence 1
         gray = _LEAST_GRAY + (stored - 1.0) * (255 - _LEAST_GRAY) / 254
         gray = np.where(stored > 0, gray, 0).astype(np.uint8)
@@ -362,6 +365,72 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2g}"
     return "" if value is None else str(value)
+
+
+# Pictures of a key
+
+
+def front_camera(drive: Drive) -> str:
+    """Return the name of a recording's camera that is shown: by its name the front camera."""
+    return order_front_first([*drive.cameras], {}, {})[0]
+
+
+def find_map(record: KeyRecord, kinds: tuple[str, ...], camera: str) -> str | None:
+    """Return the path, relative to the set, of a camera's first map of one of these kinds."""
+    paths = [PurePosixPath(name) for name in record.files]
+    of_camera = (p for p in paths if camera in (p.stem, p.parent.name) and {*kinds} & {*p.parts})
+    return next(map(str, of_camera), None)
+
+
+def _shrink(values: NDArray[Any]) -> NDArray[Any]:
+    """Return a map with every n-th row and column, about as wide as a picture."""
+    step = max(1, values.shape[1] // _WIDTH_PX)
+    return np.ascontiguousarray(values[::step, ::step])
+
+
+def _small_image(drive: Drive, key: int, size_px: tuple[int, int]) -> Picture | None:
+    """Return the RGB image at a key sweep, resized to (width, height); None if there is none."""
+    camera = drive.cameras[front_camera(drive)]
+    try:
+        sequence = _open(drive.data)
+        number = key_shots(sequence, [camera], key)[camera.name].number
+        image = None if number is None else sequence.image(camera.name, number)
+    except (InputError, KeyError):  # the recording has moved, or no longer holds the sweep
+        return None
+    if image is None:
+        return None
+    return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+
+
+@lru_cache(maxsize=1)
+def _open(data: str) -> LidarSequence:
+    """Open a recording, and keep the last one open."""
+    return open_sequence(data)
+
+
+def _draw_depth(depth_m: Float32, image: Picture | None) -> Picture:
+    """Return an RGB picture of depth (h,w) over an image of that size, over black without one."""
+    below = np.zeros((*depth_m.shape, 3), np.uint8) if image is None else image
+    return np.ascontiguousarray(depth_over_image(below, depth_m)[:, :, ::-1])
+
+
+def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> Path:
+    """Write the picture of a key whose maps are not kept, and return its path.
+
+    Args:
+        out: Folder of the training set.
+        drive: Recording of the key.
+        key: Frame number of the key.
+        filled_m: (H,W) filled depth of the `front_camera` in metres, 0 for no depth.
+    """
+    small_m = _shrink(filled_m)
+    picture = _draw_depth(small_m, _small_image(drive, key, small_m.shape[::-1]))
+    path = out / _ASIDE / drive.name / f"{key:010d}.jpg"
+    write_file(path, encode_jpeg(picture, _QUALITY))
+    return path
+
+
+# Files
 
 
 def write_comparison_page(folder: Path) -> Path:

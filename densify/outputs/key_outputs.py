@@ -190,6 +190,11 @@ def _write_movers(result: Result, folder: Path) -> None:
         write_cloud(mover_folder / "cloud.laz", mover.cloud, result.stamp_ns)
 
 
+def _write_figure(result: Result, folder: Path) -> None:
+    """Write ``figure.png``: the maps of the baselines from top to bottom, then the result's."""
+    plots.write_figure(folder / "figure.png", {**result.baselines, result.method: result})
+
+
 def _write_metrics(result: Result, folder: Path) -> None:
     """Write ``metrics.json``, the scores of the result and of its baselines."""
     table = {
@@ -302,7 +307,7 @@ _WRITERS: Mapping[tuple[str, ...], Callable[[Result, Path], None]] = {
     ("cloud.laz",): _write_cloud,
     ("scene",): _write_scene,
     ("metrics.json",): _write_metrics,
-    ("figure.png",): plots.write_key_figure,
+    ("figure.png",): _write_figure,
     ("curve.png",): plots.write_curve,
 }
 """Names of the entries in the folder of a key sweep, and the function that writes them.

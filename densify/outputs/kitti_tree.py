@@ -141,26 +141,21 @@ def _write_frame(run: FinishedRun, objects: _Objects, folder: Path, sequence: st
     if (jpeg := run.jpeg(map_name)) is not None:
         image = encode_png(decode_image(jpeg, run.folder))
         write_file(folder / "image_02" / sequence / f"{file}.png", image)
-    write_file(folder / "calib" / f"{sequence}.txt", _calibration(view).encode())
+    P = np.hstack([view.camera.K, np.zeros((3, 1))])  # of rectified camera 0 and image_02 too
+    calibration = {f"P{n}": P for n in range(4)}
+    calibration |= {"R_rect": np.eye(3), "Tr_velo_cam": view.camera.T_cam_lidar[:3]}
+    calibration |= {"Tr_imu_velo": np.eye(4)[:3]}
+    rows = (
+        f"{name}: {' '.join(f'{x:.12e}' for x in values.ravel())}\n"
+        for name, values in calibration.items()
+    )
+    write_file(folder / "calib" / f"{sequence}.txt", "".join(rows).encode())
     lines = []
     for number, track in objects.items():
         T_cam_object = view.camera.T_cam_lidar @ _measured_pose(track, run.key, cloud)
         if label := _label(track.size_m, T_cam_object, view):
             lines.append(f"{run.key} {number} {label}\n")
     return lines
-
-
-def _calibration(view: CameraView) -> str:
-    """Return the calibration file of a camera, which is rectified camera 0 and image_02 too."""
-    P = np.hstack([view.camera.K, np.zeros((3, 1))])
-    entries = {f"P{n}": P for n in range(4)}
-    entries |= {"R_rect": np.eye(3), "Tr_velo_cam": view.camera.T_cam_lidar[:3]}
-    entries |= {"Tr_imu_velo": np.eye(4)[:3]}
-    lines = (
-        f"{name}: {' '.join(f'{x:.12e}' for x in values.ravel())}\n"
-        for name, values in entries.items()
-    )
-    return "".join(lines)
 
 
 def _measured_pose(track: ObjectTrack, key: int, cloud: StoredCloud) -> Float:
