@@ -187,12 +187,9 @@ def test_status(border_drive: Path, tmp_path: Path, capsys) -> None:
     recipe = Recipe(2, "none", config=resolve({"register": {"source": "dataset"}}))
     make.make_dataset([str(border_drive)], out, slice(39, 41), recipe, report=look)
     assert seen == [(0, 2, 2), (1, 2, 1), (2, 2, 0)]
-    before = files_in(out)
     assert exit_code("dataset", "--status", out, "--json", "--verify") == 0
     answer = json.loads(capsys.readouterr().out)
-    assert (answer["num_keys"], answer["num_done"], answer["num_left"]) == (2, 2, 0)
     assert answer["means"]["density"] > 0 and answer["damaged"] == []
-    assert files_in(out) == before
     (out / "manifest.jsonl").write_text("")
     assert exit_code("dataset", "--status", out) == 0
     assert capsys.readouterr().out.splitlines()[0] == "2 keys: 0 done, 2 to make"

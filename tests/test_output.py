@@ -17,7 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from densify.outputs import plots
 from densify.outputs.cloud_files import read_cloud, write_cloud
 from densify.outputs.depth_png import (
     read_depth_png,
@@ -270,20 +269,3 @@ def test_comparison_is_written_beside_the_run(put, tmp_path):
     compare(tmp_path / "out", overwrite=True, seed=5)
     assert paths[1].read_bytes() != before
     assert (folder / "cloud.laz").is_file()
-
-
-def test_the_figure_is_red_nearby_blue_far_away_and_gray_without_depth():
-    depth_m = np.zeros((60, 600), np.float32)
-    depth_m[:, :100], depth_m[:, 200:300], depth_m[30, 500] = 3.0, 80.0, 3.0
-    figure = plots.draw_figure(
-        np.full((60, 600, 3), 200, np.uint8), {"one": depth_m, "two": depth_m}
-    )
-    title, panel = figure[:36], figure[36:96].astype(int)
-    assert figure.shape[1:] == (600, 3) and np.array_equal(figure[132:192], panel)
-    assert (title == 255).all(axis=2).mean() > 0.9 and (title < 100).any()
-    blue, _, red = panel[10, [50, 250]].T
-    assert red[0] > 2 * blue[0] and blue[1] > red[1]
-    gray = panel[10, 400]
-    assert len({*gray}) == 1 and 0 < gray[0] < 200
-    drawn = (panel != gray).any(axis=2)[:, 400:]
-    assert drawn.sum() == 9 and drawn[29:32, 99:102].all()  # a measurement covers 3 x 3 pixels

@@ -228,7 +228,7 @@ class Manifest:
             root.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(root / f".{stem}.lock", os.O_RDWR | os.O_CREAT, 0o666)
             try:
-                _lock(self._lock, root)
+                self._take_lock()
                 self._put_in_order()
             except BaseException:
                 os.close(self._lock)
@@ -273,6 +273,18 @@ class Manifest:
             _log.debug("key %d of %s: put aside (%s)", record.key, record.drive, reasons[name])
         return aside
 
+    def _take_lock(self) -> None:
+        """Take the lock, which is released when the process ends, even by a crash."""
+        root = self.path.parent
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"--out {root}: another run is at work there; wait for it, or use another --out"
+            ) from error
+        except OSError as error:
+            _log.warning("%s: no locks here (%s); start no second run there", root, error.strerror)
+
     def _put_in_order(self) -> None:
         """Sort the lines of the file, the last line of each key sweep alone."""
         data = b"".join(line for _, (_, line) in sorted(_read(self.path).items()))
@@ -304,23 +316,6 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
     if damaged[-1:] == [len(lines)]:  # the last line is empty, or cut by a killed process
         del damaged[-1]
     if damaged:
-        _log.warning(
-            "%s: %d of %d lines are damaged, the first is line %d; their keys are made again",
-            path,
-            len(damaged),
-            len(lines) - 1,
-            damaged[0],
-        )
+        told = f"{len(damaged)} of {len(lines) - 1} lines are damaged, the first is line"
+        _log.warning("%s: %s %d; their keys are made again", path, told, damaged[0])
     return records
-
-
-def _lock(lock: int, root: Path) -> None:
-    """Take the lock, which is released when the process ends, even by a crash."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise InputError(
-            f"--out {root}: another run is at work there; wait for it, or use another --out"
-        ) from error
-    except OSError as error:
-        _log.warning("%s: no locks here (%s); start no second run there", root, error.strerror)

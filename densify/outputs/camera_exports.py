@@ -26,7 +26,7 @@ from densify.geometry.types import Camera, Float, Float32
 from densify.outputs.atomic import write_file, write_json
 from densify.outputs.cloud_files import StoredCloud, save_ply
 from densify.outputs.depth_png import encode_png, metres
-from densify.outputs.export import exr_writer
+from densify.outputs.export import save_exr
 from densify.outputs.finished_run import FinishedRun, key_poses
 from densify.outputs.recording_folder import drive_folder
 from densify.readers.decoded_files import decode_image
@@ -126,7 +126,6 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write a scene as map-anything's data_processing/README.md has it; depth in metres, 0 none."""
-    save_exr = exr_writer()
     pictures = _pictures(runs, flat=True)
     _write_jpegs(pictures, folder)
     frames = []
