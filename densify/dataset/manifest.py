@@ -132,20 +132,21 @@ def manifest(folder: str | Path) -> Any:
     InputError is raised. A folder without a manifest gives an empty table.
     """
     pandas = import_extra("pandas", "pandas", "tables of a manifest")
-    rows = []
-    for record in read_manifests(Path(folder)).values():
-        row = {name: getattr(record, name) for name in ("drive", "key", "status", "reason")}
-        row |= {"seconds": record.seconds, "num_sweeps": len(record.frames)}
-        row["warnings"] = "; ".join(record.warnings)
-        for name, score in record.scores.items():
-            by_camera = score if isinstance(score, Mapping) else {"": score}
-            row |= {f"{name}.{camera}".rstrip("."): value for camera, value in by_camera.items()}
-        rows.append(row)
+    fields = ("drive", "key", "status", "reason", "seconds")
+    rows = [
+        {
+            **{name: getattr(record, name) for name in fields},
+            "num_sweeps": len(record.frames),
+            "warnings": "; ".join(record.warnings),
+            **record.scores,
+        }
+        for record in read_manifests(Path(folder)).values()
+    ]
     if not rows:
         raise InputError(
             f"{folder}: no key in manifest*.jsonl; expected a folder that make_dataset wrote"
         )
-    return pandas.DataFrame(rows)
+    return pandas.json_normalize(rows)
 
 
 def describe_pace(records: Iterable[KeyRecord]) -> str:
