@@ -61,6 +61,7 @@ _log = logging.getLogger("densify")
 _KEYS_PER_PROCESS = 8  # fewer are done before another process has started
 _BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # memory per process, and per sweep of 64 rings
 _JUDGED = {"ghost": "ghosts", "outliers": "held-out outliers"}
+_Keys = list[tuple["Job", int]]  # key sweeps, each by its job and frame number
 Shard = tuple[int, int]
 """(i, n), part i of n, from 1."""
 
@@ -141,12 +142,9 @@ def make_dataset(
             clear_leftovers(out, age_s)
             if recipe.layout == "kitti-depth":
                 write_readme(out, recipe.method, recipe.window, as_mapping(recipe.config))
-            blocks, before = _blocks(drives, shard), read_manifests(out)
-            wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
-            done = finished(before.values(), out, verify)
-            records = {name: before[name] for name in sorted(wanted & done)}
-            groups = _jobs(blocks, done, recipe, out, num_workers)
-            num_keys = len(wanted)
+            blocks = _blocks(drives, shard, recipe, out)
+            num_keys, records = sum(map(len, blocks)), _finished(blocks, out, verify)
+            groups = _left(blocks, records.keys(), num_workers)
             _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
             outcomes = call_all(make_key, groups, num_workers, log, scheduler)
             summary = _record(outcomes, manifest, records, num_keys, report)
@@ -206,28 +204,29 @@ def _free_bytes() -> float:
     return min(sizes)
 
 
-def _blocks(drives: Sequence[Drive], shard: Shard | None) -> list[tuple[Drive, tuple[int, ...]]]:
-    """Return the key frame numbers of all blocks, or of the consecutive blocks of one shard."""
+def _blocks(drives: Sequence[Drive], shard: Shard | None, recipe: Recipe, out: Path) -> list[_Keys]:
+    """Return the key sweeps of each block, or of the consecutive blocks of one shard."""
+    run, blocks = uuid4().hex, list[_Keys]()
+    for drive in drives:
+        job = Job(drive, recipe, out.absolute(), run)
+        blocks += [[(job, key) for key in keys] for keys in drive.blocks]
     number, num_shards = shard or (1, 1)
-    blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
     begin, end = (len(blocks) * part // num_shards for part in (number - 1, number))
     return blocks[begin:end]
 
 
-def _jobs(
-    blocks: Sequence[tuple[Drive, tuple[int, ...]]],
-    done: Collection[Key],
-    recipe: Recipe,
-    out: Path,
-    num_workers: int,
-) -> list[list[tuple[Job, int]]]:
+def _finished(blocks: Sequence[_Keys], out: Path, verify: bool) -> dict[Key, KeyRecord]:
+    """Return the records of the key sweeps in these blocks that are finished, sorted by key."""
+    wanted = {(job.drive.name, key) for block in blocks for job, key in block}
+    before = read_manifests(out)
+    return {name: before[name] for name in sorted(wanted & finished(before.values(), out, verify))}
+
+
+def _left(blocks: Sequence[_Keys], done: Collection[Key], num_workers: int) -> list[_Keys]:
     """Return the key sweeps to make, in a group for each block."""
     # The first key sweep of a group computes the results that the group shares.
-    run, groups = uuid4().hex, []
-    for drive, keys in blocks:
-        job = Job(drive, recipe, out.absolute(), run)
-        if group := [(job, key) for key in keys if (drive.name, key) not in done]:
-            groups.append(group)
+    groups = [[(j, key) for j, key in block if (j.drive.name, key) not in done] for block in blocks]
+    groups = [group for group in groups if group]
     # Workers begin at distant blocks, because neighbouring blocks share results too.
     step = math.ceil(len(groups) / num_workers)
     return [group for start in range(step) for group in groups[start::step]]
@@ -280,10 +279,13 @@ def _set_aside(
         """Write the picture of a finished key, and return its path."""
         drive = drive_of[record.drive]
         name = find_map(record, FILLED, front_camera(drive))
-        with suppress(InputError):  # a damaged map, which is deleted anyway
-            if name is not None:
-                return [keep_picture(out, drive, record.key, read_depth_png(out / name))]
-        return []
+        if name is None:
+            return []
+        try:
+            filled_m = read_depth_png(out / name)
+        except InputError:  # a damaged map, which is deleted anyway
+            return []
+        return [keep_picture(out, drive, record.key, filled_m)]
 
     max_ratio = recipe.gate.max_ratio
     worse = {} if max_ratio is None else worse_than_neighbours(records, max_ratio)
