@@ -63,6 +63,9 @@ def test_options_that_cannot_be(border_drive: Path, tmp_path: Path, capsys) -> N
         assert exit_code("dataset", "--data", border_drive, option, "--out", out) == 2
         assert words in capsys.readouterr().err
     assert "--out DIR" in refused(capsys, 2, "dataset", "--data", border_drive)
+    same = copy_drive(border_drive, tmp_path / "2011_09_26")
+    message = refused(capsys, 2, "dataset", border_drive, same, "--out", out)
+    assert str(same) in message and str(border_drive) in message and "--out" in message
     with pytest.raises(InputError, match=r"--workers 0: expected 1"):
         make.make_dataset([str(border_drive)], out, num_workers=0)
     assert not out.exists()
@@ -86,12 +89,6 @@ def test_a_set_grows(border_drive: Path, tmp_path: Path, capsys) -> None:
     assert exit_code("dataset", "--status", out) == 0
     assert capsys.readouterr().out.startswith("4 keys: 4 done\n")
     assert read_plan(out)["drives"][DRIVE]["frames"] == [[39, 39], [41, 41]]
-
-
-def test_recordings_that_cannot_be_in_one_set(border_drive: Path, tmp_path: Path, capsys) -> None:
-    same, out = copy_drive(border_drive, tmp_path / "2011_09_26"), tmp_path / "out"
-    message = refused(capsys, 2, "dataset", border_drive, same, "--out", out)
-    assert str(same) in message and str(border_drive) in message and "--out" in message
 
 
 # Places
@@ -139,23 +136,6 @@ def test_a_set_is_made_one_way(
     message = refused(capsys, 2, "dataset", *arguments)
     assert f"--out {out}: " in message and words in message
     assert files_in(out) == before
-
-
-def test_as_many_workers_as_cores_free_memory_and_keys_suffice_for(
-    border_drive: Path, monkeypatch
-) -> None:
-    assert make._free_bytes() > 1e8
-    drives = 32 * plan([str(border_drive)], slice(39, 41), Recipe())  # 64 keys
-    monkeypatch.setattr(make, "num_threads", lambda: 6)
-    for free_bytes, wanted, num_drives, num in (
-        (900e9, None, 32, 6),
-        (900e9, None, 16, 4),
-        (10e9, None, 32, 3),
-        (1e9, None, 32, 1),
-        (900e9, 9, 1, 9),
-    ):
-        monkeypatch.setattr(make, "_free_bytes", lambda value=free_bytes: value)
-        assert make._num_processes(wanted, Recipe(), drives[:num_drives]) == num
 
 
 # Gate
@@ -207,12 +187,9 @@ def test_status(border_drive: Path, tmp_path: Path, capsys) -> None:
     recipe = Recipe(2, "none", config=resolve({"register": {"source": "dataset"}}))
     make.make_dataset([str(border_drive)], out, slice(39, 41), recipe, report=look)
     assert seen == [(0, 2, 2), (1, 2, 1), (2, 2, 0)]
-    before = files_in(out)
     assert exit_code("dataset", "--status", out, "--json", "--verify") == 0
     answer = json.loads(capsys.readouterr().out)
-    assert (answer["num_keys"], answer["num_done"], answer["num_left"]) == (2, 2, 0)
     assert answer["means"]["density"] > 0 and answer["damaged"] == []
-    assert files_in(out) == before
     (out / "manifest.jsonl").write_text("")
     assert exit_code("dataset", "--status", out) == 0
     assert capsys.readouterr().out.splitlines()[0] == "2 keys: 0 done, 2 to make"

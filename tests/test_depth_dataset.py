@@ -17,9 +17,11 @@ from torch.utils.data import DataLoader
 import densify
 from densify.config.errors import InputError
 from densify.dataset.loader import DepthDataset
-from densify.dataset.manifest import KeyRecord
-from densify.outputs.depth_png import stored_confidence, write_confidence_png, write_depth_png
-from densify.outputs.kitti_tree import FileRecord
+from densify.dataset.manifest import FileRecord, KeyRecord
+from densify.dataset.plan import Recipe, plan, write_plan
+from densify.geometry.types import DepthMap
+from densify.outputs.depth_png import stored_confidence
+from densify.outputs.kitti_tree import write_key
 
 W, H = 60, 24
 K = np.array([[50.0, 0.25, 27.0], [0, 48.0, 10.0], [0, 0, 1]])
@@ -53,29 +55,21 @@ def write_recording(date: Path, drive: str, rng: np.random.Generator) -> dict:
     return images
 
 
-def write_maps(folder: Path, camera: str, frame: int, rng: np.random.Generator) -> SimpleNamespace:
+def maps_of(camera: str, rng: np.random.Generator) -> tuple[DepthMap, DepthMap]:
+    """Of the key sweep alone, and of all sweeps."""
     filled_m = np.where(rng.random((H, W)) < 0.6, rng.uniform(2, 80, (H, W)), 0)
     filled_m = (np.rint(256 * filled_m) / 256).astype(np.float32)
     dense_m = np.where(rng.random((H, W)) < 0.7, filled_m, np.float32(0))
     sparse_m = np.where(rng.random((H, W)) < 0.1, dense_m, np.float32(0))
-    confidence = rng.random((H, W), dtype=np.float32)
-    *paths, path = (folder / f"proj_depth/{kind}/{camera}/{frame:010d}.png" for kind in KINDS)
-    for depth_path, depth_m in zip(paths, (sparse_m, dense_m, filled_m), strict=True):
-        depth_path.parent.mkdir(parents=True, exist_ok=True)
-        write_depth_png(depth_path, depth_m)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_confidence_png(path, confidence, filled_m)
-    return SimpleNamespace(
-        sparse_m=sparse_m, dense_m=dense_m, filled_m=filled_m, confidence=confidence
+    confidence, frame = rng.random((H, W), dtype=np.float32), np.zeros((H, W), np.int32)
+    sparse, dense = (
+        DepthMap(camera, depth_m, filled_m, confidence, frame) for depth_m in (sparse_m, dense_m)
     )
-
-
-def folder_of(drive: str) -> str:
-    return f"{'val' if drive == VAL else 'train'}/{drive}"
+    return sparse, dense
 
 
 def line_of(drive: str, frame: int, status: str = "done", cameras=CAMERAS) -> bytes:
-    tree = f"{folder_of(drive)}/proj_depth"
+    tree = f"{'val' if drive == VAL else 'train'}/{drive}/proj_depth"
     paths = [f"{tree}/{k}/{c}/{frame:010d}.png" for k in KINDS for c in cameras]
     files = dict.fromkeys(paths, FileRecord.of(b"")) if status == "done" else {}
     return KeyRecord(drive, frame, status, files=files).to_line()
@@ -83,28 +77,26 @@ def line_of(drive: str, frame: int, status: str = "done", cameras=CAMERAS) -> by
 
 @pytest.fixture
 def made(tmp_path):
-    """A set of two drives by hand, one of each split; its recordings are under ``tmp_path/raw``."""
+    """A set of two drives, one of each split; its recordings are under ``tmp_path/raw``."""
     rng = np.random.default_rng(5)
     root, date = tmp_path / "set", tmp_path / "raw" / "2011_09_26"
-    camera = {"width_px": W, "height_px": H, "K": K.tolist(), "distortion": []}
-    camera["T_cam_lidar"] = np.eye(4).tolist()
-    drives, maps, images, lines = {}, {}, {}, []
+    maps, images, lines = {}, {}, []
     for drive, frames in FRAMES.items():
-        folder = folder_of(drive)
         recorded = write_recording(date, drive, rng)
         images |= {(drive, *where): image for where, image in recorded.items()}
         for frame in reversed(frames):
             lines.append(line_of(drive, frame))
-            for name in CAMERAS:
-                maps[drive, name, frame] = write_maps(root / folder, name, frame, rng)
-        cameras = dict.fromkeys(CAMERAS, camera)
-        data = str(date / drive)
-        drives[drive] = {"data": data, "folder": folder, "frames": [[0, 9]], "cameras": cameras}
-    about = {"schema_version": 1, "layout": "kitti-depth", "method": "flow", "drives": drives}
-    about |= {"densify": "0.1.0", "window": 5, "cameras": None, "gate": {}, "config": {}}
+            pairs = {name: maps_of(name, rng) for name in CAMERAS}
+            maps |= {(drive, name, frame): pair for name, pair in pairs.items()}
+            sparse, dense = ({name: pair[i] for name, pair in pairs.items()} for i in (0, 1))
+            write_key(root / ("val" if drive == VAL else "train") / drive, frame, sparse, dense)
+    write_plan(root, Recipe(), plan([str(date / drive) for drive in FRAMES], None, Recipe()))
+    about = json.loads((root / "dataset.json").read_text())
+    for drive in about["drives"].values():  # with the skew that KITTI's calibration lacks
+        drive["cameras"] = {n: {**c, "K": K.tolist()} for n, c in drive["cameras"].items()}
     (root / "dataset.json").write_text(json.dumps(about))
     (root / "manifest.jsonl").write_bytes(b"".join(lines))
-    return SimpleNamespace(root=root, date=date, maps=maps, images=images, about=about)
+    return SimpleNamespace(root=root, date=date, maps=maps, images=images)
 
 
 def where_of(sample) -> tuple[str, str, int]:
@@ -119,12 +111,12 @@ def test_every_value_comes_back(made, filled):
     dataset = densify.DepthDataset(made.root, filled=filled)
     assert [where_of(s) for s in dataset] == sorted(made.maps)
     for sample in dataset:
-        maps = made.maps[where_of(sample)]
-        dense_m = maps.filled_m if filled else maps.dense_m
-        levels = stored_confidence(maps.confidence)
+        sparse, dense = made.maps[where_of(sample)]
+        dense_m = dense.filled_m if filled else dense.depth_m
+        levels = stored_confidence(dense.confidence)
         certain = np.where(dense_m > 0, (levels - 1.0) / 254, 0)
         image = made.images[where_of(sample)].transpose(2, 0, 1)
-        np.testing.assert_array_equal(sample["sparse_depth_m"][0], maps.sparse_m)
+        np.testing.assert_array_equal(sample["sparse_depth_m"][0], sparse.depth_m)
         np.testing.assert_array_equal(sample["dense_depth_m"][0], dense_m)
         np.testing.assert_allclose(sample["confidence"][0], certain, atol=1e-6)
         np.testing.assert_allclose(sample["image"], image / 255, atol=1e-6)
@@ -249,12 +241,13 @@ def test_sets_and_options_that_cannot_be_used(made):
     for crop in ((H + 1, 20), (0, 20)):
         refused(made.root, f"{crop[0]} x 20", f"{H} x {W}", crop=crop)
     path = made.root / "dataset.json"
+    about = json.loads(path.read_text())
     for change, words in (
         ({"layout": "densify"}, "--layout kitti-depth"),
         ({"schema_version": 2}, "schema_version 2"),
         ({"drives": {VAL: {"data": "x"}}}, "damaged"),
     ):
-        path.write_text(json.dumps({**made.about, **change}))
+        path.write_text(json.dumps({**about, **change}))
         refused(made.root, path, words)
     path.unlink()
     refused(made.root, path, "densify dataset --layout kitti-depth")

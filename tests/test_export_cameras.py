@@ -252,21 +252,13 @@ def test_a_set_by_the_reader_of_moge(put) -> None:
         assert (folder / place / "image.jpg").is_file()
 
 
-@pytest.mark.parametrize("to", ["nerfstudio", "splats", "wai", "moge"])
-def test_several_keys_share_one_world(drive: Path, tmp_path: Path, to: str) -> None:
-    pytest.importorskip("OpenEXR")
-    out = tmp_path / "out"
-    export_run(drive, to, out)
-    if to == "moge":
-        assert len((out / ".index.txt").read_text().split()) == 2
-        return
-    if to == "splats":
-        assert len([*(out / "depths").iterdir()]) == len([*(out / "images").iterdir()]) == 2
-        assert (out / "movers" / f"{KEY:06d}" / "tracks.json").is_file()
-        return
-    table = json.loads((out / {"wai": "scene_meta.json"}.get(to, "transforms.json")).read_text())
-    axes = np.eye(4) if to == "wai" else np.diag([1, -1, -1, 1])
-    T_world_cam = [np.array(frame["transform_matrix"]) @ axes for frame in table["frames"]]
+def test_several_keys_share_one_world(drive: Path, tmp_path: Path) -> None:
+    export_run(drive, "nerfstudio", tmp_path / "n")
+    export_run(drive, "splats", tmp_path / "s")
+    assert len([*(tmp_path / "s" / "depths").iterdir()]) == 2
+    assert (tmp_path / "s" / "movers" / f"{KEY:06d}" / "tracks.json").is_file()
+    frames = json.loads((tmp_path / "n" / "transforms.json").read_text())["frames"]
+    T_world_cam = [frame["transform_matrix"] @ np.diag([1, -1, -1, 1]) for frame in frames]
     truth = [one_car().T_world_lidar(key) for key in (KEY, KEY + 1)]
     T_lidar_cam = np.linalg.inv(one_car().cameras["front"].T_cam_lidar)
     moved = np.linalg.inv(truth[0] @ T_lidar_cam) @ truth[1] @ T_lidar_cam

@@ -11,13 +11,13 @@ import pytest
 
 from densify.config.errors import InputError, OutputError
 from densify.dataset.manifest import (
+    FileRecord,
     KeyRecord,
     Manifest,
     damaged_files,
     finished,
     read_manifests,
 )
-from densify.outputs.kitti_tree import FileRecord
 
 DRIVE = "2011_09_26_drive_0013_sync"
 

@@ -17,8 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-import densify
-from densify.outputs import plots
 from densify.outputs.cloud_files import read_cloud, write_cloud
 from densify.outputs.depth_png import (
     read_depth_png,
@@ -27,8 +25,7 @@ from densify.outputs.depth_png import (
     write_depth_png,
 )
 from densify.outputs.key_outputs import check_writable, write_comparison, write_result
-from densify.outputs.kitti_tree import FileRecord, write_key, write_readme
-from tests.exported import CAMERAS, KEY_NS, H, W, cloud_of, map_of, refusal, result_of, tree
+from tests.exported import CAMERAS, KEY_NS, H, W, cloud_of, refusal, result_of, tree
 
 CONFIG = {"objective": {"alpha": 10.0, "radius_m": None}, "register": {"source": "kiss-icp"}}
 MAPS = [f"{k}/{c}.png" for k in ("depth", "depth_filled", "confidence", "age") for c in CAMERAS]
@@ -89,9 +86,6 @@ def test_values_that_are_no_depth(tmp_path):
     for bad in (np.nan, np.inf, -1.0):
         with pytest.raises(ValueError, match="finite depths, 0 or more"):
             write_depth_png(tmp_path / "a.png", np.array([[1, bad]], np.float32))
-    ageless = {n: replace(depth, age_s=None) for n, depth in result_of().depth.items()}
-    with pytest.raises(ValueError, match="image_02: expected ages"):
-        write_result(replace(result_of(), depth=ageless), tmp_path, config={}, data="street")
     assert not list(tmp_path.iterdir())
 
 
@@ -187,6 +181,8 @@ def test_result_is_written_as_the_contract_says(put, tmp_path):
     first = tree(tmp_path)
     put(overwrite=True)
     assert tree(tmp_path) == first
+    paths = put(result_of(cameras=()), overwrite=True)
+    assert [p.name for p in paths] == ["cloud.laz", "metrics.json", "run.yaml"]
 
 
 def test_tables_are_plain_json_and_yaml(put, tmp_path):
@@ -209,11 +205,6 @@ def test_tables_are_plain_json_and_yaml(put, tmp_path):
     assert record["config"] == CONFIG | {"project": {"size": 3.0, "pair": [1, 2]}}
     assert record["stages"][0] == {"name": "register", "seconds": 1.235, "peak_memory_mb": 512.3}
     assert record["versions"]["numpy"] == np.__version__
-
-
-def test_without_cameras_there_is_only_a_cloud(put):
-    paths = put(result_of(cameras=()))
-    assert [p.name for p in paths] == ["cloud.laz", "metrics.json", "run.yaml"]
 
 
 def test_existing_result_is_kept_or_replaced_with_the_rest_kept(put, tmp_path):
@@ -278,63 +269,3 @@ def test_comparison_is_written_beside_the_run(put, tmp_path):
     compare(tmp_path / "out", overwrite=True, seed=5)
     assert paths[1].read_bytes() != before
     assert (folder / "cloud.laz").is_file()
-
-
-def test_the_figure_is_red_nearby_blue_far_away_and_gray_without_depth():
-    depth_m = np.zeros((60, 600), np.float32)
-    depth_m[:, :100], depth_m[:, 200:300], depth_m[30, 500] = 3.0, 80.0, 3.0
-    figure = plots.draw_figure(
-        np.full((60, 600, 3), 200, np.uint8), {"one": depth_m, "two": depth_m}
-    )
-    title, panel = figure[:36], figure[36:96].astype(int)
-    assert figure.shape[1:] == (600, 3) and np.array_equal(figure[132:192], panel)
-    assert (title == 255).all(axis=2).mean() > 0.9 and (title < 100).any()
-    blue, _, red = panel[10, [50, 250]].T
-    assert red[0] > 2 * blue[0] and blue[1] > red[1]
-    gray = panel[10, 400]
-    assert len({*gray}) == 1 and 0 < gray[0] < 200
-    drawn = (panel != gray).any(axis=2)[:, 400:]
-    assert drawn.sum() == 9 and drawn[29:32, 99:102].all()  # a measurement covers 3 x 3 pixels
-
-
-# --- KITTI's depth tree, as its own loaders and tools would read it -------------------------------
-
-PRODUCTS = ("velodyne_raw", "groundtruth", "groundtruth_filled", "confidence")
-FOLDER = "val/2011_09_26_drive_0013_sync"
-
-
-def test_a_kitti_tree_comes_back(tmp_path: Path) -> None:
-    sparse, dense = (
-        {camera: map_of(camera, seed + i) for i, camera in enumerate(CAMERAS)} for seed in (1, 2)
-    )
-    records = write_key(tmp_path, FOLDER, 120, sparse, dense)
-    assert {name: FileRecord.of(data) for name, data in tree(tmp_path).items()} == records
-    for camera in CAMERAS:
-        paths = [f"{FOLDER}/proj_depth/{kind}/{camera}/0000000120.png" for kind in PRODUCTS]
-        assert {*paths} <= {*records} and len(records) == len(PRODUCTS) * len(CAMERAS)
-        raster = [stored(tmp_path / path) for path in paths]
-        maps_m = (sparse[camera].depth_m, dense[camera].depth_m, dense[camera].filled_m)
-        for steps, depth_m in zip(raster, maps_m, strict=False):
-            expected_m = np.where(depth_m < 256, depth_m, 0)  # farther is none in this format
-            # As the README says
-            np.testing.assert_allclose(steps / 256, expected_m, atol=1 / 512)
-            np.testing.assert_array_equal(steps > 0, expected_m > 0)
-        level, has_depth = raster[3], raster[2] > 0
-        assert level.dtype == np.uint8
-        np.testing.assert_array_equal(level > 0, has_depth)
-        confidence = (level.astype(float) - 1)[has_depth] / 254
-        np.testing.assert_allclose(
-            confidence, dense[camera].confidence[has_depth], atol=0.5 / 254 + 1e-6
-        )
-
-
-# README
-
-
-def test_the_readme_says_how_the_set_was_made(tmp_path: Path) -> None:
-    settings = {"gate": {"min_score": np.float64(0.5)}, "config": {"flow": {"braces": "{window}"}}}
-    write_readme(tmp_path, method="flow", window=5, settings=settings)
-    text = (tmp_path / "README.txt").read_text("utf-8")
-    facts = ("flow, window 5", "11 lidar sweeps", *PRODUCTS, "min_score: 0.5", "'{window}'")
-    for part in (densify.__version__, *facts):
-        assert part in text, part

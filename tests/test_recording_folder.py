@@ -23,8 +23,8 @@ from densify.outputs.recording_folder import (
     split_of,
 )
 from densify.readers.depth_trees import pair_depth_files
-from tests.command import exit_code, files_in, refused
-from tests.dataset_scenes import BORDER, DRIVE, copy_drive
+from tests.command import files_in, refused
+from tests.dataset_scenes import DRIVE, copy_drive
 from tests.exported import write_views
 
 STREET = "street?sensor=vlp16"
@@ -36,16 +36,10 @@ VERBS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("recording", "folder"),
-    [
-        ("street:street?seed=0&sensor=hdl64", "street"),
-        ("street:street?seed=1&sensor=hdl64", "street-street_seed-1_sensor-hdl64"),
-        (DRIVE, DRIVE),
-    ],
-)
-def test_each_recording_has_its_folder(recording: str, folder: str) -> None:
-    assert default_folder(recording) == Path("densify-out") / folder
+def test_each_recording_has_its_folder() -> None:
+    assert default_folder("street:street?seed=0&sensor=hdl64") == Path("densify-out/street")
+    other = drive_folder("street:street?seed=1&sensor=hdl64")
+    assert other == "street-street_seed-1_sensor-hdl64" and drive_folder(DRIVE) == DRIVE
 
 
 def test_the_split_is_that_of_the_benchmark() -> None:
@@ -71,18 +65,6 @@ def test_any_name_becomes_one_harmless_folder(names: list[str]) -> None:
         assert folder.isascii() and len(folder) <= 100
         assert not set(folder) & set("/\\\0 \n\"'") and folder[0] not in ".-"
         assert drive_folder(folder) == folder
-
-
-def test_runs_go_there_by_default(border_drive: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(border_drive.parent)
-    monkeypatch.setattr("densify.outputs.recording_folder.RESULTS", tmp_path / "densify-out")
-    options = ["--key", BORDER, "--window", "1", "--method", "none"]
-    options += ["--set", "register.source=dataset"]
-    assert exit_code("run", DRIVE, *options) == 0
-    folder = tmp_path / "densify-out" / DRIVE / f"{BORDER:06d}"
-    record = yaml.safe_load((folder / "run.yaml").read_text("utf-8"))
-    # The path holds in every working folder.
-    assert (record["recording"], record["data"]) == (DRIVE, str(border_drive))
 
 
 @pytest.mark.parametrize("verb", VERBS)

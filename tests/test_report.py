@@ -45,17 +45,8 @@ def results() -> dict[str, Result]:
 
 def write_run(out: Path, report: bool = True) -> Path:
     """The key's folder."""
-    result = results()["flow"]
-    config = as_mapping(resolve(CONFIG))
-    if not report:
-        config = {**config, "output": {**config["output"], "report": False}}
-    write_result(result, out, config=config, data="tiny street")
-    return out / FOLDER
-
-
-def write_compared(out: Path) -> Path:
-    config = as_mapping(resolve(POSES_GIVEN))
-    write_comparison(results(), out, config=config, data="tiny street")
+    config = as_mapping(resolve(CONFIG if report else POSES_GIVEN))
+    write_result(results()["flow"], out, config=config, data="tiny street")
     return out / FOLDER
 
 
@@ -173,9 +164,10 @@ def test_paths_lead_through_the_key(run: Path) -> None:
 
 
 def test_a_comparison_has_all_methods(tmp_path: Path) -> None:
-    folder = write_compared(tmp_path)
+    config = as_mapping(resolve(POSES_GIVEN))
+    write_comparison(results(), tmp_path, config=config, data="tiny street")
     (page,) = write_report(tmp_path)
-    assert page == folder / "compare.html"
+    assert page == tmp_path / FOLDER / "compare.html"
     data = data_of(page.read_bytes())
     assert list(data["methods"]) == ["none", "icp", "flow"] and data["method"] == "flow"
     assert list(data["cameras"]["front"]["others"]) == ["none", "icp"]

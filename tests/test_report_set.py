@@ -14,10 +14,9 @@ import pytest
 
 import densify
 from densify.config.errors import InputError
-from densify.dataset.manifest import KeyRecord, describe_pace, describe_rest
+from densify.dataset.manifest import FileRecord, KeyRecord, describe_pace, describe_rest
 from densify.dataset.plan import Recipe, plan, write_plan
 from densify.dataset.report import write_report
-from densify.outputs.kitti_tree import FileRecord
 from tests.command import refused
 from tests.dataset_scenes import DRIVE, FRAMES
 
@@ -99,7 +98,7 @@ def test_the_slowest_key_has_no_part_in_the_time_of_the_others() -> None:
     records = [replace(scored(key), seconds=s) for key, s in enumerate((100.0, 6.0, 12.0, 6.0))]
     assert describe_pace(records) == "31.0 s a key (6.0 to 100.0)"
     assert describe_rest(records, 60) == "the other 60 keys take about 6 to 9 min in one process"
-    assert describe_rest(records[:1], 60) == ""
+    assert describe_rest(records[:1], 60) == "60 keys are left"
 
 
 def test_a_key_leads_to_its_own_page_and_many_keys_have_a_histogram(described: Path) -> None:

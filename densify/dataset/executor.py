@@ -132,8 +132,7 @@ def _until_a_death(
                 is_broken = True
             done = wait(running, return_when=FIRST_COMPLETED).done
             if is_broken or any(isinstance(future.exception(), BrokenExecutor) for future in done):
-                is_broken = True
-                done = wait(running).done
+                is_broken, done = True, wait(running).done
             for future in done:
                 yield running.pop(future), _outcome(future.result)
 
@@ -200,14 +199,15 @@ def _open_dask(scheduler: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
 
 def _begin(environment: dict[str, str]) -> None:
+    """Prepare a worker process, which ends with its parent."""
     os.environ.update(environment)
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the command ends its workers itself
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+
+    def end_with_parent() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()

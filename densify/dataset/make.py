@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -30,10 +30,10 @@ from densify.dataset.manifest import (
     KeyRecord,
     Manifest,
     damaged_files,
+    describe_files,
     finished,
     read_manifests,
 )
-from densify.dataset.pictures import FILLED, find_map, front_camera, keep_picture
 from densify.dataset.plan import (
     Drive,
     Recipe,
@@ -43,13 +43,14 @@ from densify.dataset.plan import (
     read_plan,
     write_plan,
 )
+from densify.dataset.report import FILLED, find_map, front_camera, keep_picture
 from densify.flow.engines import check_engine
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Result
 from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
 from densify.outputs.depth_png import read_depth_png
 from densify.outputs.key_outputs import write_result
-from densify.outputs.kitti_tree import FileRecord, write_key, write_readme
+from densify.outputs.kitti_tree import write_key, write_readme
 from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import looks_around, methods_of_run
 from densify.pipeline.recording import Recording
@@ -60,6 +61,7 @@ _log = logging.getLogger("densify")
 _KEYS_PER_PROCESS = 8  # fewer are done before another process has started
 _BASE_BYTES, _SWEEP_BYTES = 1.5e9, 0.15e9  # memory per process, and per sweep of 64 rings
 _JUDGED = {"ghost": "ghosts", "outliers": "held-out outliers"}
+_Keys = list[tuple["Job", int]]  # key sweeps, each by its job and frame number
 Shard = tuple[int, int]
 """(i, n), part i of n, from 1."""
 
@@ -140,9 +142,9 @@ def make_dataset(
             clear_leftovers(out, age_s)
             if recipe.layout == "kitti-depth":
                 write_readme(out, recipe.method, recipe.window, as_mapping(recipe.config))
-            blocks = _blocks(drives, shard)
-            num_keys, records = sum(len(keys) for _, keys in blocks), _finished(blocks, out, verify)
-            groups = _jobs(blocks, records.keys(), recipe, out, num_workers)
+            blocks = _blocks(drives, shard, recipe, out)
+            num_keys, records = sum(map(len, blocks)), _finished(blocks, out, verify)
+            groups = _left(blocks, records.keys(), num_workers)
             _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
             outcomes = call_all(make_key, groups, num_workers, log, scheduler)
             summary = _record(outcomes, manifest, records, num_keys, report)
@@ -164,10 +166,9 @@ def status(out: Path) -> Summary:
 
 def damaged(out: Path) -> list[str]:
     """Return the files, relative to ``out``, that are missing or differ from recorded hashes."""
-    finished_records = (
-        record for record in read_manifests(out).values() if record.status != "failed"
-    )
-    return [name for record in finished_records for name in damaged_files(record, out)]
+    tried = read_manifests(out).values()
+    kept = (record for record in tried if record.status != "failed")
+    return [name for record in kept for name in damaged_files(record, out)]
 
 
 # The command's process
@@ -203,38 +204,29 @@ def _free_bytes() -> float:
     return min(sizes)
 
 
-def _blocks(drives: Sequence[Drive], shard: Shard | None) -> list[tuple[Drive, tuple[int, ...]]]:
-    """Return the key frame numbers of all blocks, or of the consecutive blocks of one shard."""
+def _blocks(drives: Sequence[Drive], shard: Shard | None, recipe: Recipe, out: Path) -> list[_Keys]:
+    """Return the key sweeps of each block, or of the consecutive blocks of one shard."""
+    run, blocks = uuid4().hex, list[_Keys]()
+    for drive in drives:
+        job = Job(drive, recipe, out.absolute(), run)
+        blocks += [[(job, key) for key in keys] for keys in drive.blocks]
     number, num_shards = shard or (1, 1)
-    blocks = [(drive, keys) for drive in drives for keys in drive.blocks]
-    begin = len(blocks) * (number - 1) // num_shards
-    end = len(blocks) * number // num_shards
+    begin, end = (len(blocks) * part // num_shards for part in (number - 1, number))
     return blocks[begin:end]
 
 
-def _finished(
-    blocks: Sequence[tuple[Drive, tuple[int, ...]]], out: Path, verify: bool
-) -> dict[Key, KeyRecord]:
+def _finished(blocks: Sequence[_Keys], out: Path, verify: bool) -> dict[Key, KeyRecord]:
     """Return the records of the key sweeps in these blocks that are finished, sorted by key."""
-    wanted = {(drive.name, key) for drive, keys in blocks for key in keys}
+    wanted = {(job.drive.name, key) for block in blocks for job, key in block}
     before = read_manifests(out)
     return {name: before[name] for name in sorted(wanted & finished(before.values(), out, verify))}
 
 
-def _jobs(
-    blocks: Sequence[tuple[Drive, tuple[int, ...]]],
-    done: Collection[Key],
-    recipe: Recipe,
-    out: Path,
-    num_workers: int,
-) -> list[list[tuple[Job, int]]]:
+def _left(blocks: Sequence[_Keys], done: Collection[Key], num_workers: int) -> list[_Keys]:
     """Return the key sweeps to make, in a group for each block."""
     # The first key sweep of a group computes the results that the group shares.
-    run, groups = uuid4().hex, []
-    for drive, keys in blocks:
-        job = Job(drive, recipe, out.absolute(), run)
-        if group := [(job, key) for key in keys if (drive.name, key) not in done]:
-            groups.append(group)
+    groups = [[(j, key) for j, key in block if (j.drive.name, key) not in done] for block in blocks]
+    groups = [group for group in groups if group]
     # Workers begin at distant blocks, because neighbouring blocks share results too.
     step = math.ceil(len(groups) / num_workers)
     return [group for start in range(step) for group in groups[start::step]]
@@ -281,24 +273,23 @@ def _set_aside(
     drives: Sequence[Drive],
 ) -> dict[Key, KeyRecord]:
     """Put keys far worse than their neighbours aside, and return their new records."""
-    if recipe.gate.max_ratio is None:
-        return {}
-    worse = worse_than_neighbours(records, recipe.gate.max_ratio)
-    keep = partial(_keep_picture, out, {drive.name: drive for drive in drives})
+    drive_of = {drive.name: drive for drive in drives}
+
+    def keep(record: KeyRecord) -> list[Path]:
+        """Write the picture of a finished key, and return its path."""
+        drive = drive_of[record.drive]
+        name = find_map(record, FILLED, front_camera(drive))
+        if name is None:
+            return []
+        try:
+            filled_m = read_depth_png(out / name)
+        except InputError:  # a damaged map, which is deleted anyway
+            return []
+        return [keep_picture(out, drive, record.key, filled_m)]
+
+    max_ratio = recipe.gate.max_ratio
+    worse = {} if max_ratio is None else worse_than_neighbours(records, max_ratio)
     return {record.name: record for record in manifest.set_aside(worse, keep)}
-
-
-def _keep_picture(
-    out: Path, drives: Mapping[str, Drive], record: KeyRecord
-) -> dict[str, FileRecord]:
-    """Write the picture of a finished key that is put aside; return its path and record."""
-    drive = drives[record.drive]
-    name = find_map(record, FILLED, front_camera(drive))
-    try:
-        filled_m = None if name is None else read_depth_png(out / name)
-    except InputError:  # a damaged map, which is deleted anyway
-        filled_m = None
-    return {} if filled_m is None else keep_picture(out, drive, record.key, filled_m)
 
 
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
@@ -319,30 +310,21 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
         # Twice a window: the keys whose windows an end cuts are the minority of neighbours.
         num_beside = 2 * max(len(record.frames) for record in drive)
         for score, title in _JUDGED.items():
-            shares = [max(record.values_of(score), default=np.nan) for record in drive]
-            for row, median in _outlying(shares, num_beside, USUAL_SHARES[score][1], max_ratio):
-                if drive[row].status == "done":
-                    worse[drive[row].name].append(
+            shares = np.array([max(r.values_of(score), default=np.nan) for r in drive])
+            for row, record in enumerate(drive):
+                # At the ends, all neighbours are on one side.
+                begin = max(0, min(row - num_beside // 2, len(drive) - num_beside - 1))
+                beside = np.delete(shares[begin : begin + num_beside + 1], row - begin)
+                beside = beside[np.isfinite(beside)]
+                # With a single neighbour it is unknown which of the two keys is unusual.
+                median = float(np.median(beside)) if len(beside) > 1 else np.inf
+                bound = max(USUAL_SHARES[score][1], max_ratio * median)
+                if record.status == "done" and shares[row] > bound:
+                    worse[record.name].append(
                         f"{title} {100 * shares[row]:.2g} %, more than {max_ratio:g} times the "
                         f"{100 * median:.2g} % of the neighbouring keys (median)"
                     )
     return {name: "; ".join(reasons) for name, reasons in sorted(worse.items())}
-
-
-def _outlying(
-    shares: Sequence[float], num_beside: int, usual_share: float, max_ratio: float
-) -> Iterator[tuple[int, float]]:
-    """Yield (row, median of ``num_beside`` neighbours) of shares that are worse than usual."""
-    for row, share in enumerate(shares):
-        # At the ends, all neighbours are on one side.
-        begin = max(0, min(row - num_beside // 2, len(shares) - num_beside - 1))
-        beside = np.array([*shares[begin:row], *shares[row + 1 : begin + num_beside + 1]])
-        beside = beside[np.isfinite(beside)]
-        # With a single neighbour it is unknown which of the two keys is unusual.
-        if len(beside) > 1:
-            median = float(np.median(beside))
-            if share > max(usual_share, max_ratio * median):
-                yield row, median
 
 
 # Any process
@@ -374,16 +356,14 @@ def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
         record = KeyRecord(job.drive.name, key, "failed", str(error))
     except Exception as error:  # other key sweeps may succeed
         _log.debug("key %d of %s: %s", key, job.drive.name, traceback.format_exc())
-        record = KeyRecord(job.drive.name, key, "failed", _unexpected(error))
+        reason = f"{type(error).__name__}: {error}"
+        if is_out_of_memory(error):
+            advice = "fewer --workers or a smaller --window take less"
+            reason = f"out of memory ({reason}); {advice}"
+        else:
+            reason = f"this is a bug in densify; please report it with densify.log: {reason}"
+        record = KeyRecord(job.drive.name, key, "failed", reason)
     return replace(record, seconds=time.perf_counter() - start_s)
-
-
-def _unexpected(error: Exception) -> str:
-    """Return the reason in the manifest for an error that densify does not raise itself."""
-    message = f"{type(error).__name__}: {error}"
-    if is_out_of_memory(error):
-        return f"out of memory ({message}); fewer --workers or a smaller --window take less"
-    return f"this is a bug in densify; please report it with densify.log: {message}"
 
 
 def _densified(job: Job, key: int) -> KeyRecord:
@@ -399,26 +379,24 @@ def _densified(job: Job, key: int) -> KeyRecord:
     result = results[recipe.method]
     scores = _scores(result.metrics)
     reason = recipe.gate.reason(scores, len(result.frames))
-    files = _write(job, results) if reason is None else _keep_result(job, result)
+    paths = _write(job, results) if reason is None else _keep_result(job, result)
     return KeyRecord(
         job.drive.name,
         key,
         "done" if reason is None else "aside",
         reason,
         frames=result.frames,
-        files=files,
+        files=describe_files(job.out, paths),
         scores=scores,
         warnings=result.warnings,
     )
 
 
-def _keep_result(job: Job, result: Result) -> dict[str, FileRecord]:
-    """Write the picture of a key that is beyond a limit; return its path and record."""
+def _keep_result(job: Job, result: Result) -> list[Path]:
+    """Write the picture of a key that is beyond a limit, if it has a map, and return its path."""
     camera = front_camera(job.drive)
-    names = [name for name in result.depth if name.partition("/")[0] == camera]
-    if not names:
-        return {}
-    return keep_picture(job.out, job.drive, result.key, result.depth[names[0]].filled_m)
+    maps = [maps for name, maps in result.depth.items() if name.partition("/")[0] == camera]
+    return [keep_picture(job.out, job.drive, result.key, m.filled_m) for m in maps[:1]]
 
 
 def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
@@ -436,14 +414,13 @@ def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _write(job: Job, results: Mapping[str, Result]) -> dict[str, FileRecord]:
-    """Write the files of a key sweep, and return path relative to the set -> size and hash."""
-    result, out, drive = results[job.recipe.method], job.out, job.drive
+def _write(job: Job, results: Mapping[str, Result]) -> list[Path]:
+    """Write the files of a key sweep, and return their paths."""
+    result, folder = results[job.recipe.method], job.out / job.drive.folder
     if job.recipe.layout == "kitti-depth":
-        return write_key(out, drive.folder, result.key, results["none"].depth, result.depth)
+        return write_key(folder, result.key, results["none"].depth, result.depth)
     config = as_mapping(job.recipe.config)
-    paths = write_result(result, out / drive.folder, config=config, data=drive.data, overwrite=True)
-    return {p.relative_to(out).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
+    return write_result(result, folder, config=config, data=job.drive.data, overwrite=True)
 
 
 @lru_cache(maxsize=1)
@@ -454,14 +431,9 @@ def _opened(job: Job) -> tuple[Recording, Cache]:
             f"the worker on {platform.node()} has densify {__version__}, the command has "
             f"{job.version}; install the same on both"
         )
-    cache, recipe = Cache(), job.recipe
+    cache, recipe, keys = Cache(), job.recipe, job.drive.keys
+    sequence, around = open_sequence(job.drive.data), looks_around([recipe.method])
     recording = Recording(
-        open_sequence(job.drive.data),
-        recipe.config,
-        recipe.window,
-        job.drive.keys,
-        cache,
-        job.run,
-        looks_around=looks_around([recipe.method]),
+        sequence, recipe.config, recipe.window, keys, cache, job.run, looks_around=around
     )
     return recording, cache

@@ -18,6 +18,7 @@ A killed process can damage only the last line. A later line of a key sweep repl
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import logging
 import os
@@ -32,7 +33,6 @@ import numpy as np
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import import_extra, parse_json, read_bytes
 from densify.outputs.atomic import plain, write_file
-from densify.outputs.kitti_tree import FileRecord
 
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]
@@ -49,6 +49,24 @@ USUAL_SHARES: Mapping[str, tuple[float, float]] = {
 }
 """Score of a manifest line -> range of 5 to 95 % of 20 keys of KITTI's drive 2011_09_26 0013
 (frames 96 to 134, every second, window 5)."""
+
+
+@dataclass(frozen=True)
+class FileRecord:
+    """The expected size of a file in bytes and its hexadecimal SHA-256."""
+
+    num_bytes: int
+    sha256: str
+
+    @staticmethod
+    def of(data: bytes) -> FileRecord:
+        """Return the record of a file with this content."""
+        return FileRecord(len(data), hashlib.sha256(data).hexdigest())
+
+
+def describe_files(root: Path, paths: Iterable[Path]) -> dict[str, FileRecord]:
+    """Return path relative to ``root`` -> record of the file, for existing files."""
+    return {p.relative_to(root).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
 
 
 @dataclass(frozen=True)
@@ -114,20 +132,21 @@ def manifest(folder: str | Path) -> Any:
     InputError is raised. A folder without a manifest gives an empty table.
     """
     pandas = import_extra("pandas", "pandas", "tables of a manifest")
-    rows = []
-    for record in read_manifests(Path(folder)).values():
-        row = {name: getattr(record, name) for name in ("drive", "key", "status", "reason")}
-        row |= {"seconds": record.seconds, "num_sweeps": len(record.frames)}
-        row["warnings"] = "; ".join(record.warnings)
-        for name, score in record.scores.items():
-            by_camera = score if isinstance(score, Mapping) else {"": score}
-            row |= {f"{name}.{camera}".rstrip("."): value for camera, value in by_camera.items()}
-        rows.append(row)
+    fields = ("drive", "key", "status", "reason", "seconds")
+    rows = [
+        {
+            **{name: getattr(record, name) for name in fields},
+            "num_sweeps": len(record.frames),
+            "warnings": "; ".join(record.warnings),
+            **record.scores,
+        }
+        for record in read_manifests(Path(folder)).values()
+    ]
     if not rows:
         raise InputError(
             f"{folder}: no key in manifest*.jsonl; expected a folder that make_dataset wrote"
         )
-    return pandas.DataFrame(rows)
+    return pandas.json_normalize(rows)
 
 
 def describe_pace(records: Iterable[KeyRecord]) -> str:
@@ -140,10 +159,10 @@ def describe_pace(records: Iterable[KeyRecord]) -> str:
 
 
 def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:
-    """Return the time that further keys take as text, "" if it cannot be told."""
+    """Return as text how long further keys take, if known, else how many are left; "" for none."""
     seconds = sorted(record.seconds for record in records)
     if len(seconds) < 2 or not num_left:
-        return ""
+        return f"{num_left:,} keys are left" if num_left else ""
     others = seconds[:-1]  # the slowest key waited for compilation
     low_s, high_s = np.quantile(others, 0.25), max(np.quantile(others, 0.75), np.mean(others))
     low, high = (f"{num_left * value / 60:.0f}" for value in (low_s, high_s))
@@ -171,17 +190,16 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
     A file is changed if its size differs or, with ``by_content``, its hash.
     """
-    damaged = []
-    for name, file in record.files.items():
+
+    def is_whole(path: Path, file: FileRecord) -> bool:
         try:
-            is_whole = (root / name).stat().st_size == file.num_bytes and (
-                not by_content or FileRecord.of(read_bytes(root / name, file.num_bytes)) == file
-            )
+            if path.stat().st_size != file.num_bytes:
+                return False
+            return not by_content or FileRecord.of(read_bytes(path, file.num_bytes)) == file
         except (InputError, OSError):
-            is_whole = False
-        if not is_whole:
-            damaged.append(name)
-    return damaged
+            return False
+
+    return [name for name, file in record.files.items() if not is_whole(root / name, file)]
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
@@ -211,7 +229,7 @@ class Manifest:
             root.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(root / f".{stem}.lock", os.O_RDWR | os.O_CREAT, 0o666)
             try:
-                _lock(self._lock, root)
+                self._take_lock()
                 self._put_in_order()
             except BaseException:
                 os.close(self._lock)
@@ -235,26 +253,38 @@ class Manifest:
     def set_aside(
         self,
         reasons: Mapping[Key, str],
-        keep_picture: Callable[[KeyRecord], Mapping[str, FileRecord]],
+        keep_picture: Callable[[KeyRecord], Iterable[Path]],
     ) -> list[KeyRecord]:
         """Delete the files of these finished keys, record the reasons, return the new records.
 
-        ``keep_picture`` returns the files that take their place. Keys that are not done in this
-        manifest are left out.
+        ``keep_picture`` returns the paths of files that take their place. Keys that are not done in
+        this manifest are left out.
         """
         aside = []
         for name, (record, _) in _read(self.path).items():
             if name not in reasons or record.status != "done":
                 continue
-            kept = keep_picture(record)
+            files = describe_files(self.path.parent, keep_picture(record))
             with self._errors_explained():
                 # Files first: if the process is killed here, the key sweep is made again.
                 for file in record.files:
                     (self.path.parent / file).unlink(missing_ok=True)
-            aside.append(replace(record, status="aside", reason=reasons[name], files=kept))
+            aside.append(replace(record, status="aside", reason=reasons[name], files=files))
             self.append(aside[-1])
             _log.debug("key %d of %s: put aside (%s)", record.key, record.drive, reasons[name])
         return aside
+
+    def _take_lock(self) -> None:
+        """Take the lock, which is released when the process ends, even by a crash."""
+        root = self.path.parent
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"--out {root}: another run is at work there; wait for it, or use another --out"
+            ) from error
+        except OSError as error:
+            _log.warning("%s: no locks here (%s); start no second run there", root, error.strerror)
 
     def _put_in_order(self) -> None:
         """Sort the lines of the file, the last line of each key sweep alone."""
@@ -287,23 +317,6 @@ def _read(path: Path) -> dict[Key, tuple[KeyRecord, bytes]]:
     if damaged[-1:] == [len(lines)]:  # the last line is empty, or cut by a killed process
         del damaged[-1]
     if damaged:
-        _log.warning(
-            "%s: %d of %d lines are damaged, the first is line %d; their keys are made again",
-            path,
-            len(damaged),
-            len(lines) - 1,
-            damaged[0],
-        )
+        told = f"{len(damaged)} of {len(lines) - 1} lines are damaged, the first is line"
+        _log.warning("%s: %s %d; their keys are made again", path, told, damaged[0])
     return records
-
-
-def _lock(lock: int, root: Path) -> None:
-    """Take the lock, which is released when the process ends, even by a crash."""
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise InputError(
-            f"--out {root}: another run is at work there; wait for it, or use another --out"
-        ) from error
-    except OSError as error:
-        _log.warning("%s: no locks here (%s); start no second run there", root, error.strerror)

@@ -21,18 +21,20 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes
 from densify.geometry import poses
+from densify.geometry.arrays import joined_rows
 from densify.geometry.types import Camera, Float, Float32
 from densify.outputs.atomic import write_file, write_json
 from densify.outputs.cloud_files import StoredCloud, save_ply
 from densify.outputs.depth_png import encode_png, metres
-from densify.outputs.export import exr_writer
+from densify.outputs.export import save_exr
 from densify.outputs.finished_run import FinishedRun, key_poses
 from densify.outputs.recording_folder import drive_folder
 from densify.readers.decoded_files import decode_image
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE_LENS = ("k1", "k2", "k3", "k4")
-_FULL_OPENCV_PARAMS = 12
+# COLMAP's model without fisheye -> number of its parameters: fx, fy, cx, cy and the lens
+_COLMAP_MODELS = {"PINHOLE": 4, "OPENCV": 8, "FULL_OPENCV": 12}
 _INVERSE_STEPS = 65536  # the training of Gaussian splatting divides by this number
 _LOG_STEPS = 65533  # MoGe divides by this number
 # In OpenGL's axes, which nerfstudio has, y is up and the camera looks along -z.
@@ -53,6 +55,16 @@ class Picture(NamedTuple):
         """Return (H,W) measured depth along the camera's axis in metres, 0 for no depth."""
         self.run.require_z(self.map)
         return metres(self.run.maps(self.map)["depth"])
+
+    def rectified_m(self, to: str) -> Float32:
+        """Return `measured_m`; raise InputError, for format ``to``, if the image has distortion."""
+        depth_m = self.measured_m()
+        if not self.camera.is_rectified:
+            raise InputError(
+                f"{self.name}: --to {to} takes images without distortion; leave the camera out by "
+                f"naming the others with --camera"
+            )
+        return depth_m
 
 
 def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
@@ -100,34 +112,28 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
         )
     frames = []
     for picture in pictures:
-        path = folder / "depth" / f"{picture.name}.npy"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, picture.measured_m() * np.float32(1000))
-        frames.append(_nerfstudio_frame(picture))
+        depth = f"depth/{picture.name}.npy"
+        (folder / depth).parent.mkdir(parents=True, exist_ok=True)
+        np.save(folder / depth, picture.measured_m() * np.float32(1000))
+        frames.append(_nerfstudio_frame(picture, depth))
     columns = _world_cloud(runs).columns()
     vertex = ("x", "y", "z", "red", "green", "blue")
     save_ply(folder / "cloud.ply", {name: columns[name] for name in vertex})
-    transforms = {
-        "camera_model": "OPENCV_FISHEYE" if fisheyes.pop() else "OPENCV",
-        "ply_file_path": "cloud.ply",
-        "frames": frames,
-    }
-    write_json(folder / "transforms.json", transforms)
+    model = "OPENCV_FISHEYE" if fisheyes.pop() else "OPENCV"
+    table = {"camera_model": model, "ply_file_path": "cloud.ply", "frames": frames}
+    write_json(folder / "transforms.json", table)
 
 
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write a scene as map-anything's data_processing/README.md has it; depth in metres, 0 none."""
-    save_exr = exr_writer()
     pictures = _pictures(runs, flat=True)
     _write_jpegs(pictures, folder)
     frames = []
     for picture in pictures:
-        depth_m, depth = picture.measured_m(), f"depth/{picture.name}.exr"
-        _require_pinhole(picture, "wai")
+        depth_m, depth = picture.rectified_m("wai"), f"depth/{picture.name}.exr"
         save_exr(folder / depth, "Y", depth_m)
         files = {"image": f"images/{picture.name}.jpg", "depth": depth}
         frames.append({"frame_name": picture.name, **files, **_shared_fields(picture)})
-    modalities = {name: {"frame_key": name, "format": name} for name in ("image", "depth")}
     meta = {
         "scene_name": f"{drive_folder(runs[0].recording)}-{runs[0].key:06d}",
         "dataset_name": "densify",
@@ -137,7 +143,7 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
         "camera_convention": "opencv",
         "frames": frames,
         "scene_modalities": {},
-        "frame_modalities": modalities,
+        "frame_modalities": {n: {"frame_key": n, "format": n} for n in ("image", "depth")},
     }
     write_json(folder / "scene_meta.json", meta)
 
@@ -147,8 +153,7 @@ def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
     names = []
     for run in runs:
         for picture in _pictures([run], flat=True):
-            depth_m, camera = picture.measured_m(), picture.camera
-            _require_pinhole(picture, "moge")
+            depth_m, camera = picture.rectified_m("moge"), picture.camera
             name = f"keys/{drive_folder(run.recording)}/{run.key:06d}_{picture.name}"
             names.append(name)
             K = camera.K + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
@@ -165,7 +170,7 @@ def _pictures(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture]:
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         for map_name in run.cameras:
             if (jpeg := run.jpeg(map_name)) is not None:
-                view = run.views[map_name]
+                view = run.scene.views[map_name]
                 name = f"{run.key:06d}/{map_name}" if len(runs) > 1 else map_name
                 name = name.replace("/", "_") if flat else name
                 T_cam_world = view.T_cam_key @ poses.inverse(T_world_key)
@@ -192,7 +197,7 @@ def _world_cloud(runs: Sequence[FinishedRun]) -> StoredCloud:
             cloud = cloud.select(cloud.frame == run.key)
             cloud = replace(cloud, points=poses.transform(T_world_key, cloud.points))
         clouds.append(cloud.select(cloud.observed))
-    return StoredCloud.joined(clouds)
+    return joined_rows(clouds)
 
 
 def _write_model(
@@ -223,9 +228,8 @@ def _colmap_model(camera: Camera) -> tuple[str, list[float]]:
     params = list(_intrinsics(camera).values())
     if camera.model == "fisheye":
         return "OPENCV_FISHEYE", params
-    if len(params) in (4, 8):
-        return "PINHOLE" if len(params) == 4 else "OPENCV", params
-    return "FULL_OPENCV", params + [0.0] * (_FULL_OPENCV_PARAMS - len(params))
+    model, size = next(item for item in _COLMAP_MODELS.items() if item[1] >= len(params))
+    return model, params + [0.0] * (size - len(params))
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -245,21 +249,17 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
 
 def _shared_fields(picture: Picture) -> dict[str, Any]:
     """Return the fields that nerfstudio and map-anything share, pose in OpenCV's axes."""
-    camera, lens = picture.camera, _intrinsics(picture.camera)
+    fx, fy, cx, cy, *_ = _intrinsics(picture.camera).values()
     return {
         "file_path": f"images/{picture.name}.jpg",
         "transform_matrix": poses.inverse(picture.T_cam_world),
-        "fl_x": lens["fx"],
-        "fl_y": lens["fy"],
-        "cx": lens["cx"],
-        "cy": lens["cy"],
-        "w": camera.width_px,
-        "h": camera.height_px,
+        **{"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy},
+        **{"w": picture.camera.width_px, "h": picture.camera.height_px},
     }
 
 
-def _nerfstudio_frame(picture: Picture) -> dict[str, Any]:
-    """Return the entry of a picture in transforms.json."""
+def _nerfstudio_frame(picture: Picture, depth: str) -> dict[str, Any]:
+    """Return the entry of a picture in transforms.json; ``depth`` is the path of its depth."""
     frame, lens = _shared_fields(picture), _intrinsics(picture.camera)
     supported = _FISHEYE_LENS if picture.camera.model == "fisheye" else _LENS[:5]
     if unknown := [name for name in _LENS if lens.get(name) and name not in supported]:
@@ -267,12 +267,9 @@ def _nerfstudio_frame(picture: Picture) -> dict[str, Any]:
             f"{picture.name}: nerfstudio has no lens with {', '.join(unknown)}; leave it out by "
             f"naming the others with --camera"
         )
-    return {
-        **frame,
-        "depth_file_path": f"depth/{picture.name}.npy",
-        **{name: lens.get(name, 0.0) for name in supported},
-        "transform_matrix": frame["transform_matrix"] @ _OPENGL,
-    }
+    coefficients = {name: lens.get(name, 0.0) for name in supported}
+    frame["transform_matrix"] = frame["transform_matrix"] @ _OPENGL
+    return {**frame, "depth_file_path": depth, **coefficients}
 
 
 def _write_inverse_depths(pictures: Sequence[Picture], folder: Path) -> None:
@@ -298,8 +295,8 @@ def _write_inverse_depths(pictures: Sequence[Picture], folder: Path) -> None:
 
 def _write_movers(run: FinishedRun, folder: Path) -> None:
     """Write the moving points of a run: a file for each tracked object, and the others."""
-    cloud = run.cloud()
-    moving = StoredCloud.joined([cloud.select(cloud.moving), *run.mover_clouds()])
+    cloud = run.whole_cloud()
+    moving = cloud.select(cloud.moving)
     is_tracked = np.zeros(len(moving.points), bool)
     for track in run.tracks:
         of_track = moving.instance == track.instance
@@ -335,15 +332,6 @@ def _logarithmic_png(depth_m: Float32) -> bytes:
     info.add_text("far", repr(far_m))
     Image.fromarray(steps).save(file, "PNG", pnginfo=info)
     return file.getvalue()
-
-
-def _require_pinhole(picture: Picture, to: str) -> None:
-    """Raise InputError unless the picture's camera has no distortion."""
-    if not picture.camera.is_rectified:
-        raise InputError(
-            f"{picture.name}: --to {to} takes images without distortion; leave the camera out by "
-            f"naming the others with --camera"
-        )
 
 
 def _text(numbers: Sequence[float]) -> str:

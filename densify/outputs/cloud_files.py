@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import datetime
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.geometry.arrays import table
+from densify.geometry.arrays import select_rows, table
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int
 from densify.outputs.atomic import write_file
 from densify.readers.decoded_files import read_las
@@ -39,7 +39,7 @@ _EXTRA_DIMENSIONS = (
 )
 _DISPLACED = ("displaced_x", "displaced_y", "displaced_z")
 _COLOURS = ("red", "green", "blue")
-_STANDARD_DIMENSIONS = {"intensity", "gps_time", *_COLOURS}
+_DIMENSIONS = {"intensity", "gps_time", *_COLOURS, *(name for name, *_ in _EXTRA_DIMENSIONS)}
 _PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar", "u2": "ushort"}
 _UNOBSERVED = np.array([140, 140, 140], np.uint8)  # gray
 
@@ -59,15 +59,6 @@ class StoredCloud:
     far: Bool  # (M,) True for points of sweeps beyond the window
     displacement: Float32  # (M,3) metres from the rigidly accumulated position to ``points``
     gps_time: Float  # (M,) reference time of the source sweep in seconds, see `write_cloud`
-
-    @staticmethod
-    def joined(clouds: Sequence[StoredCloud]) -> StoredCloud:
-        """Return one cloud with the points of all clouds, in the given order."""
-        names = [field.name for field in fields(StoredCloud)]
-        columns = {
-            name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in names
-        }
-        return StoredCloud(**columns)
 
     @property
     def rigid_points(self) -> Float:
@@ -95,8 +86,7 @@ class StoredCloud:
 
     def select(self, keep: Bool | Int) -> StoredCloud:
         """Return a cloud with only the points of a mask (M,), or of an array of point indices."""
-        columns = {field.name: getattr(self, field.name)[keep] for field in fields(self)}
-        return StoredCloud(**columns)
+        return select_rows(self, keep)
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the (M,) columns by their names in cloud.laz: booleans uint8, position float32."""
@@ -122,44 +112,34 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
     if len(cloud) and not max(cloud.points.max(), -cloud.points.min()) < _MAX_COORDINATE_M:
         raise ValueError(f"cloud: expected finite points within {_MAX_COORDINATE_M:.0f} m")
     header = laspy.LasHeader(version="1.4", point_format=7)
-    header.scales = np.full(3, _SCALE_M)
-    header.offsets = np.zeros(3)
+    header.scales, header.offsets = np.full(3, _SCALE_M), np.zeros(3)
     header.creation_date = _UNIX_DAY_0 + datetime.timedelta(days=stamp_ns // _DAY_NS)
     header.generating_software = "densify"
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.global_encoding.wkt = True  # demanded by LAS 1.4 for this point format
-    header.add_extra_dims(
-        [laspy.ExtraBytesParams(name, kind, text) for name, kind, text in _EXTRA_DIMENSIONS]
-    )
-    las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header))
-    _fill_record(las.points.array, cloud, stamp_ns)
-    buffer = io.BytesIO()
-    las.write(buffer, do_compress=True)
-    write_file(path, buffer.getvalue())
-
-
-def _fill_record(record: NDArray[Any], cloud: Cloud, stamp_ns: int) -> None:
-    """Fill a structured array of point format 7 with the points of a cloud."""
+    header.add_extra_dims([laspy.ExtraBytesParams(*dimension) for dimension in _EXTRA_DIMENSIONS])
+    points = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
+    displacement = cloud.points - cloud.rigid_points
     # Columns of the plain array: those of laspy are several times slower.
-    for axis, name in enumerate("XYZ"):
-        record[name] = np.rint(cloud.points[:, axis] / _SCALE_M)
-    record["gps_time"] = (stamp_ns - _LAS_EPOCH_NS + cloud.since_key_ns) * 1e-9
-    record["intensity"] = np.rint(_MOST_LEVEL * np.clip(cloud.intensity, 0, 1))
-    for channel, name in enumerate(_COLOURS):
-        record[name] = cloud.rgb[:, channel].astype(np.uint16) * _TO_16_BITS
-    record["bit_fields"] = _ONE_RETURN
-    for axis, name in enumerate(_DISPLACED):
-        record[name] = cloud.points[:, axis] - cloud.rigid_points[:, axis]
-    for name, _, _ in _EXTRA_DIMENSIONS:
+    for axis, (name, displaced, colour) in enumerate(zip("XYZ", _DISPLACED, _COLOURS, strict=True)):
+        points.array[name] = np.rint(cloud.points[:, axis] / _SCALE_M)
+        points.array[displaced] = displacement[:, axis]
+        points.array[colour] = cloud.rgb[:, axis].astype(np.uint16) * _TO_16_BITS
+    points.array["gps_time"] = (stamp_ns - _LAS_EPOCH_NS + cloud.since_key_ns) * 1e-9
+    points.array["intensity"] = np.rint(_MOST_LEVEL * np.clip(cloud.intensity, 0, 1))
+    points.array["bit_fields"] = _ONE_RETURN
+    for name, *_ in _EXTRA_DIMENSIONS:
         if name not in _DISPLACED:
-            record[name] = getattr(cloud, name)
+            points.array[name] = getattr(cloud, name)
+    buffer = io.BytesIO()
+    laspy.LasData(header, points).write(buffer, do_compress=True)
+    write_file(path, buffer.getvalue())
 
 
 def read_cloud(path: Path) -> StoredCloud:
     """Return the cloud in a file that `write_cloud` wrote; raise InputError for other files."""
     las = read_las(path)
-    known = {*_STANDARD_DIMENSIONS, *(name for name, _, _ in _EXTRA_DIMENSIONS)}
-    if missing := known - set(las.point_format.dimension_names):
+    if missing := _DIMENSIONS - set(las.point_format.dimension_names):
         raise InputError(
             f"{path}: no dimension {', '.join(sorted(missing))}; expected a cloud of this version "
             f"of densify; densify the key again"

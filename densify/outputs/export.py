@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -33,8 +33,7 @@ class Export:
     """The written files, and the pixels and points within the thresholds."""
 
     paths: list[Path]  # paths of the files
-    # Camera -> ``measured`` and ``filled`` -> share of the pixels with a depth, for formats with
-    # maps
+    # Camera -> ``measured``, ``filled`` -> share of the pixels with a depth, for formats with maps
     density: Mapping[str, Mapping[str, Kept]]
     num_points: Kept | None = None  # number of points, for formats with a cloud
 
@@ -80,7 +79,9 @@ def export_run(
     write = getattr(module, f"write_{to.replace('-', '_')}")
     with writing(folder, (*form.owned, _RECORD), folder, overwrite) as staging:
         write(runs if form.of_drive else runs[0], staging)
-        export = Export([], runs[0].density if len(runs) == 1 else {}, _total(runs))
+        counts = [run.num_points for run in runs if run.num_points is not None]
+        num_points = Kept(*map(sum, zip(*counts, strict=True))) if counts else None
+        export = Export([], runs[0].density if len(runs) == 1 else {}, num_points)
         record = {
             "run": str(run),
             "to": to,
@@ -105,50 +106,34 @@ def facts(export: Export) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value}
 
 
-def _total(runs: Sequence[FinishedRun]) -> Kept | None:
-    """Return the number of points in all clouds that were read, None if none was read."""
-    counts = [run.num_points for run in runs if run.num_points is not None]
-    if not counts:
-        return None
-    return Kept(sum(kept.before for kept in counts), sum(kept.after for kept in counts))
-
-
 def write_npy(run: FinishedRun, folder: Path) -> None:
     """Write each map as (H,W) float32 .npy: depth, depth_filled (metres, 0 none) and confidence."""
-    _write_maps(run, folder, ".npy", lambda path, _, values: np.save(path, values))
+    for path, _, values in _maps(run, folder, ".npy"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, values)
 
 
 def write_exr(run: FinishedRun, folder: Path) -> None:
     """Write the maps of `write_npy` as 32-bit OpenEXR, channel Z for depth, Y for confidence."""
-    save = exr_writer()
-    channels = {"depth": "Z", "depth_filled": "Z", "confidence": "Y"}
-    _write_maps(run, folder, ".exr", lambda path, kind, map_: save(path, channels[kind], map_))
+    for path, kind, values in _maps(run, folder, ".exr"):
+        save_exr(path, "Y" if kind == "confidence" else "Z", values)
 
 
-def exr_writer() -> Callable[[Path, str, Float32], None]:
-    """Return a function that writes (H,W) float32 as an OpenEXR file: path, channel, values."""
+def save_exr(path: Path, channel: str, values: Float32) -> None:
+    """Write (H,W) float32 as an OpenEXR file with one channel."""
     library = import_extra("OpenEXR", "exr", "EXR files")
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
-
-    def write(path: Path, channel: str, values: Float32) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        library.File(header, {channel: values}).write(str(path))
-
-    return write
+    path.parent.mkdir(parents=True, exist_ok=True)
+    library.File(header, {channel: values}).write(str(path))
 
 
-def _write_maps(
-    run: FinishedRun, folder: Path, suffix: str, save: Callable[[Path, str, Float32], None]
-) -> None:
-    """Save the three maps of each camera by a function of path, kind and (H,W) values."""
+def _maps(run: FinishedRun, folder: Path, suffix: str) -> Iterator[tuple[Path, str, Float32]]:
+    """Yield path, kind and (H,W) values of the three maps of each camera."""
     for camera in run.cameras:
         maps = run.maps(camera)
-        values = {kind: metres(maps[kind]) for kind in ("depth", "depth_filled")}
-        values["confidence"] = confidence_of(maps["confidence"])
-        for kind, array in values.items():
-            path = map_path(folder, kind, camera, suffix)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save(path, kind, array)
+        for kind in ("depth", "depth_filled", "confidence"):
+            values = (confidence_of if kind == "confidence" else metres)(maps[kind])
+            yield map_path(folder, kind, camera, suffix), kind, values
 
 
 def write_ply(run: FinishedRun, folder: Path) -> None:

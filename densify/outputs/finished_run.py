@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError, shorten_message
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry import poses
+from densify.geometry.arrays import joined_rows
 from densify.geometry.types import Camera, CameraView, Float, Float32, ObjectTrack
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import (
@@ -104,24 +105,16 @@ def load_result(folder: str | Path) -> LoadedResult:
     run = FinishedRun(Path(folder))
     with _damage_named(run.folder / "metrics.json"):
         metrics = read_json(run.folder / "metrics.json")
-    return LoadedResult(
-        folder=run.folder,
-        key=run.key,
-        depth={camera: _loaded(run.maps(camera)) for camera in run.cameras},
-        cloud=StoredCloud.joined([run.cloud(), *run.mover_clouds()]),
-        tracks=run.tracks,
-        metrics=metrics,
-    )
-
-
-def _loaded(maps: Mapping[str, NDArray[Any]]) -> LoadedMaps:
-    """Return the maps in metres, seconds and shares from their stored values."""
-    return LoadedMaps(
-        metres(maps["depth"]),
-        metres(maps["depth_filled"]),
-        confidence_of(maps["confidence"]),
-        age_of(maps["age"]),
-    )
+    depth = {}
+    for camera in run.cameras:
+        maps = run.maps(camera)
+        depth[camera] = LoadedMaps(
+            metres(maps["depth"]),
+            metres(maps["depth_filled"]),
+            confidence_of(maps["confidence"]),
+            age_of(maps["age"]),
+        )
+    return LoadedResult(run.folder, run.key, depth, run.whole_cloud(), run.tracks, metrics)
 
 
 class FinishedRun:
@@ -129,11 +122,16 @@ class FinishedRun:
 
     def __init__(self, folder: Path, thresholds: Thresholds = EVERYTHING) -> None:
         """Open a folder with run.yaml, to read within ``thresholds``; InputError without it."""
-        path = folder / "run.yaml"
+        path, problem = folder / "run.yaml", "no run.yaml in it"
+        if (folder / "dataset.json").is_file():
+            problem = (
+                "holds a training set of maps alone (--layout kitti-depth), and the other formats "
+                "need clouds, ages and images; make the set with --layout densify to export it"
+            )
         if not path.is_file():
             raise InputError(
-                f"{folder}: {_without_run(folder)}; expected the folder of a finished run and "
-                f"key, such as densify-out/street/000120"
+                f"{folder}: {problem}; expected the folder of a finished run and key, such as "
+                f"densify-out/street/000120"
             )
         with _damage_named(path):
             record = read_yaml(path)[0]
@@ -143,8 +141,8 @@ class FinishedRun:
             self.recording = str(record.get("recording") or data.rstrip("/").rpartition("/")[2])
         self.folder = folder
         self._cameras = thresholds.cameras
-        max_age_ms = np.inf if thresholds.max_age_ms is None else thresholds.max_age_ms
         self._min_confidence = stored_confidence(thresholds.min_confidence)
+        max_age_ms = np.inf if thresholds.max_age_ms is None else thresholds.max_age_ms
         self._max_age = stored_age(max_age_ms / 1000)
         # Camera -> measured, filled -> share of pixels, for the maps read so far
         self.density: dict[str, dict[str, Kept]] = {}
@@ -166,11 +164,6 @@ class FinishedRun:
     def scene(self) -> SceneFile:
         """The content of scene.json."""
         return read_scene(self.folder / "scene" / "scene.json")
-
-    @cached_property
-    def views(self) -> dict[str, CameraView]:
-        """The camera and pose of each chosen map, by name."""
-        return {name: view for name, view in self.scene.views.items() if name in self.cameras}
 
     @cached_property
     def tracks(self) -> list[ObjectTrack]:
@@ -203,7 +196,7 @@ class FinishedRun:
         path = map_path(self.folder / "scene", "image", camera, ".jpg")
         if camera not in self.scene.views or not path.is_file():
             return None
-        expected, data = self.scene.views[camera].camera, read_bytes(path)
+        data, expected = read_bytes(path), self.scene.views[camera].camera
         height, width = decode_image(data, path).shape[:2]
         if (width, height) != (expected.width_px, expected.height_px):
             raise InputError(
@@ -247,9 +240,10 @@ class FinishedRun:
         """Return the accumulated points within the thresholds."""
         return self._read(self.folder / "cloud.laz")
 
-    def mover_clouds(self) -> list[StoredCloud]:
-        """Return a cloud for each separated object (``movers=separate``), within the thresholds."""
-        return [self._read(path) for path in sorted(self.folder.glob("movers/*/cloud.laz"))]
+    def whole_cloud(self) -> StoredCloud:
+        """Return `cloud` and the points of separated objects (``movers=separate``) after it."""
+        movers = sorted(self.folder.glob("movers/*/cloud.laz"))
+        return joined_rows([self.cloud(), *map(self._read, movers)])
 
     def _read(self, path: Path) -> StoredCloud:
         cloud = read_cloud(path)
@@ -295,16 +289,6 @@ def map_names(*folders: Path) -> list[str]:
     """Return the names of the maps in folders: CAMERA, or CAMERA/NUMBER of one image."""
     paths = {path.relative_to(folder) for folder in folders for path in folder.rglob("*.png")}
     return sorted(path.with_suffix("").as_posix() for path in paths)
-
-
-def _without_run(folder: Path) -> str:
-    """Return what a folder without run.yaml is, as a clause for an error."""
-    if (folder / "dataset.json").is_file():
-        return (
-            "holds a training set of maps alone (--layout kitti-depth), and the other formats need "
-            "clouds, ages and images; make the set with --layout densify to export it"
-        )
-    return "no run.yaml in it"
 
 
 def read_scene(path: Path) -> SceneFile:

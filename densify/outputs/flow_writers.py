@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +56,12 @@ def flow_writer(
             f"--overwrite to replace them or another --out DIR"
         )
     T_world_lidar: dict[int, Float] = {}
-    groups = _open_groups(paths[frames[0]]) if form == "opensceneflow" else nullcontext()
-    with groups as file:
+    file: Any = None
+    with ExitStack() as stack:
+        if form == "opensceneflow":
+            h5py = import_extra("h5py", "opensceneflow", "OpenSceneFlow's files")
+            aside = stack.enter_context(file_aside(paths[frames[0]]))
+            file = stack.enter_context(h5py.File(aside, "w"))
 
         def write(frame: int, flow: StretchFlow) -> Path:
             path = paths[frame]
@@ -143,14 +147,6 @@ def _chained_pose(earlier: dict[int, Float], frame: int, stretch: Stretch) -> Fl
     return earlier[previous] @ stretch.T_target_source(previous, frame)
 
 
-@contextmanager
-def _open_groups(path: Path) -> Iterator[Any]:
-    """Yield a new HDF5 file."""
-    h5py = import_extra("h5py", "opensceneflow", "OpenSceneFlow's files")
-    with file_aside(path) as aside, h5py.File(aside, "w") as file:
-        yield file
-
-
 def _add_sweep(file: Any, frame: int, to_next: StretchFlow, T_world_lidar: Float) -> None:
     """Add a sweep to an open HDF5 file, with the flow to the next sweep if known."""
     sweep, stretch = to_next.stretch[frame].sweep, to_next.stretch
@@ -230,7 +226,7 @@ def _write_paths(folder: Path, sequence: LidarSequence, T_world_lidar: dict[int,
 
 def _save_path(path: Path, track: PoseTrack, stamps_ns: Int, numbers: Sequence[int]) -> None:
     """Write the poses of a track at (n,) times, each with its number, as PLY."""
-    T = np.stack([track.at(int(ns)) for ns in stamps_ns]) if len(stamps_ns) else np.zeros((0, 4, 4))
+    T = np.array([track.at(int(ns)) for ns in stamps_ns]).reshape(-1, 4, 4)
     quaternions = Rotation.from_matrix(T[:, :3, :3]).as_quat().T if len(T) else np.zeros((4, 0))
     columns = dict(zip("xyz", T[:, :3, 3].T, strict=True))
     for names in (("qx", "qy", "qz", "qw"), ("q_x", "q_y", "q_z", "q_w")):

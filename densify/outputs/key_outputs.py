@@ -157,8 +157,8 @@ def _write_full(result: Result, folder: Path) -> None:
     """Write ``depth_full``, depth completed with the user's prior, and ``confidence_full``."""
     for camera, full in result.full.items():
         write_depth_png(map_path(folder, "depth_full", camera), full.depth_m)
-        path = map_path(folder, "confidence_full", camera)
         # At most 0.2 at pixels whose depth comes from the prior
+        path = map_path(folder, "confidence_full", camera)
         write_confidence_png(path, full.confidence, full.depth_m)
 
 
@@ -190,13 +190,16 @@ def _write_movers(result: Result, folder: Path) -> None:
         write_cloud(mover_folder / "cloud.laz", mover.cloud, result.stamp_ns)
 
 
+def _write_figure(result: Result, folder: Path) -> None:
+    """Write ``figure.png``: the maps of the baselines from top to bottom, then the result's."""
+    plots.write_figure(folder / "figure.png", {**result.baselines, result.method: result})
+
+
 def _write_metrics(result: Result, folder: Path) -> None:
     """Write ``metrics.json``, the scores of the result and of its baselines."""
     table = {
         "schema_version": SCHEMA_VERSION,
-        "key": result.key,
-        "method": result.method,
-        "frames": result.frames,
+        **{name: getattr(result, name) for name in ("key", "method", "frames")},
         **result.metrics,
         "baselines": {m: {"frames": b.frames, **b.metrics} for m, b in result.baselines.items()},
     }
@@ -207,14 +210,14 @@ def _write_tracks(result: Result, folder: Path) -> None:
     """Write ``movers.json``, the poses of moving objects, if the sweeps are registered."""
     if not result.T_key_lidar:
         return
-    names = ("stamp_ns", "num_points", "T_key_object", "velocity_m_s")
+    fields = ("instance", "size_m", "seen_size_m", "sides_seen")
+    fields_of_poses = ("stamp_ns", "num_points", "T_key_object", "velocity_m_s")
     objects = []
     for track in result.tracks:
         poses = [
-            {"frame": frame, **{name: getattr(track, name)[row] for name in names}}
+            {"frame": frame, **{name: getattr(track, name)[row] for name in fields_of_poses}}
             for row, frame in enumerate(track.frames)
         ]
-        fields = ("instance", "size_m", "seen_size_m", "sides_seen")
         objects.append({**{name: getattr(track, name) for name in fields}, "poses": poses})
     table = {"schema_version": SCHEMA_VERSION, "key": result.key, "objects": objects}
     write_json(folder / "movers.json", table)
@@ -228,15 +231,11 @@ def _record(result: Result, config: Mapping[str, Any], data: str) -> dict[str, A
         versions[package] = None  # unknown, as in system builds
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
+    copied = ("key", "stamp_ns", "method", "frames", "far_frames", "far_left_out")
     return {
         "recording": result.recording,
         "data": data,
-        "key": result.key,
-        "stamp_ns": result.stamp_ns,
-        "method": result.method,
-        "frames": result.frames,
-        "far_frames": result.far_frames,
-        "far_left_out": result.far_left_out,
+        **{name: getattr(result, name) for name in copied},
         "cameras": list(result.depth),
         "prior": {
             name: {"source": full.source, **asdict(full.fit), "share": full.from_prior.mean()}
@@ -246,12 +245,9 @@ def _record(result: Result, config: Mapping[str, Any], data: str) -> dict[str, A
         "config": config,
         "elapsed_s": round(result.elapsed_s, 3),
         "stages": [
-            {
-                "name": c.name,
-                "seconds": round(c.seconds, 3),
-                "peak_memory_mb": round(c.peak_memory_mb, 1),
-            }
-            for c in result.costs
+            {"name": cost.name, "seconds": round(cost.seconds, 3)}
+            | {"peak_memory_mb": round(cost.peak_memory_mb, 1)}
+            for cost in result.costs
         ],
         "versions": versions,
     }
@@ -261,13 +257,12 @@ def _write_scene(result: Result, folder: Path) -> None:
     """Write the folder ``scene/`` if the sweeps are registered."""
     if not result.T_key_lidar:
         return
-    scene = folder / "scene"
-    sweeps = _sweeps(result)
+    scene, sweeps = folder / "scene", _sweeps(result)
     row_of = {sweep["frame"]: row for row, sweep in enumerate(sweeps)}
     for name, maps in result.depth.items():
         if name in result.images:
-            path = map_path(scene, "image", name, ".jpg")
-            write_file(path, encode_jpeg(result.images[name]))
+            image = encode_jpeg(result.images[name])
+            write_file(map_path(scene, "image", name, ".jpg"), image)
         for method, baseline in result.baselines.items():
             write_depth_png(map_path(scene, method, name), baseline.depth[name].depth_m)
         if name in result.truth_m:
@@ -278,15 +273,11 @@ def _write_scene(result: Result, folder: Path) -> None:
         write_file(map_path(scene, "sweep", name), encode_png(lookup[maps.frame]))
         if name in result.rejected:
             write_file(map_path(scene, "reason", name), encode_png(result.rejected[name]))
-    table = {
-        "schema_version": SCHEMA_VERSION,
-        "key": result.key,
-        "sweeps": sweeps,
-        "views": {
-            name: {**vars(view.camera), **{n: v for n, v in vars(view).items() if n != "camera"}}
-            for name, view in result.views.items()
-        },
+    views = {
+        name: {**vars(view.camera), **{n: v for n, v in vars(view).items() if n != "camera"}}
+        for name, view in result.views.items()
     }
+    table = {"schema_version": SCHEMA_VERSION, "key": result.key, "sweeps": sweeps, "views": views}
     write_json(scene / "scene.json", table)
 
 
@@ -316,7 +307,7 @@ _WRITERS: Mapping[tuple[str, ...], Callable[[Result, Path], None]] = {
     ("cloud.laz",): _write_cloud,
     ("scene",): _write_scene,
     ("metrics.json",): _write_metrics,
-    ("figure.png",): plots.write_key_figure,
+    ("figure.png",): _write_figure,
     ("curve.png",): plots.write_curve,
 }
 """Names of the entries in the folder of a key sweep, and the function that writes them.

@@ -8,13 +8,11 @@ groundtruth. groundtruth_filled and confidence are additions.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
@@ -25,18 +23,11 @@ from densify.geometry import cameras, poses
 from densify.geometry.types import CameraView, DepthMap, Float, ObjectTrack
 from densify.outputs.atomic import plain, write_file, write_json
 from densify.outputs.cloud_files import StoredCloud
-from densify.outputs.depth_png import (
-    encode_png,
-    map_path,
-    write_confidence_png,
-    write_depth_png,
-)
+from densify.outputs.depth_png import encode_png, map_path, write_confidence_png, write_depth_png
 from densify.outputs.finished_run import FinishedRun
 from densify.outputs.recording_folder import drive_folder, split_of
 from densify.readers.decoded_files import decode_image
 from densify.version import __version__
-
-README = "README.txt"
 
 _KIND_OF = {"depth": "groundtruth", "depth_filled": "groundtruth_filled"}
 _UNKNOWN = 3  # occluded: unknown
@@ -45,49 +36,29 @@ _TALL_M, _CAR_M, _WIDE_M, _WALKER_M = 2.2, 6.0, 1.4, 1.2
 _ENDS = (("rear", "front"), ("right", "left"))  # sides of a box, by axis
 
 
-@dataclass(frozen=True)
-class FileRecord:
-    """The expected size of a file in bytes and its hexadecimal SHA-256."""
-
-    num_bytes: int
-    sha256: str
-
-    @staticmethod
-    def of(data: bytes) -> FileRecord:
-        """Return the record of a file with this content."""
-        return FileRecord(len(data), hashlib.sha256(data).hexdigest())
-
-
 def write_key(
-    root: Path,
-    folder: str,
-    frame: int,
-    sparse: Mapping[str, DepthMap],
-    dense: Mapping[str, DepthMap],
-) -> dict[str, FileRecord]:
-    """Write the depth maps of one key sweep, and return path in the tree -> size and hash.
-
-    Equal maps give equal bytes.
+    drive: Path, frame: int, sparse: Mapping[str, DepthMap], dense: Mapping[str, DepthMap]
+) -> list[Path]:
+    """Write the depth maps of one key sweep, and return the paths. Equal maps give equal bytes.
 
     Args:
-        root: Folder of the tree.
-        folder: Path of the drive's folder in the tree, SPLIT/DRIVE.
+        drive: Folder of the drive in the tree, SPLIT/DRIVE.
         frame: Frame number of the key sweep, the name of the files.
         sparse: Maps of the key sweep alone, by camera.
         dense: Maps of all sweeps, by camera.
     """
-    paths = []
+    written = []
     for camera, maps in dense.items():
         raw, measured, filled, confidence = (
-            _map_path(root / folder, kind, camera, f"{frame:010d}")
+            _map_path(drive, kind, camera, f"{frame:010d}")
             for kind in ("velodyne_raw", *_KIND_OF.values(), "confidence")
         )
         write_depth_png(raw, sparse[camera].depth_m)
         write_depth_png(measured, maps.depth_m)
         write_depth_png(filled, maps.filled_m)
         write_confidence_png(confidence, maps.confidence, maps.filled_m)
-        paths += [raw, measured, filled, confidence]
-    return {p.relative_to(root).as_posix(): FileRecord.of(p.read_bytes()) for p in paths}
+        written += [raw, measured, filled, confidence]
+    return written
 
 
 def _map_path(drive: Path, kind: str, camera: str, number: str) -> Path:
@@ -124,8 +95,8 @@ def _write_map(run: FinishedRun, name: str, drive: Path, root: Path) -> list[dic
     single_sweep = map_path(run.folder / "scene", "none", name)
     if single_sweep.is_file():
         write_file(_map_path(drive, "velodyne_raw", camera, number), single_sweep.read_bytes())
-    if name in run.views:
-        K = run.views[name].camera.K
+    if name in run.scene.views:
+        K = run.scene.views[name].camera.K
         text = " ".join(f"{value:.6f}" for value in K.ravel())
         write_file(map_path(drive / "intrinsics", camera, number, ".txt"), f"{text}\n".encode())
     if (jpeg := run.jpeg(name)) is None:
@@ -137,11 +108,8 @@ def _write_map(run: FinishedRun, name: str, drive: Path, root: Path) -> list[dic
     return [{**relative, "cam_in": cam_in, "depth_scale": 256.0}]
 
 
-class _KeyObjects(NamedTuple):
-    """The objects of one key."""
-
-    run: FinishedRun
-    tracks: dict[int, ObjectTrack]  # number of the object over the sequence -> its track
+_Objects = dict[int, ObjectTrack]
+"""Number of an object over the sequence -> its track in one key."""
 
 
 def write_kitti_tracking(runs: Sequence[FinishedRun], folder: Path) -> None:
@@ -153,46 +121,41 @@ def write_kitti_tracking(runs: Sequence[FinishedRun], folder: Path) -> None:
     """
     for number, (_, sequence) in enumerate(groupby(runs, key=lambda run: run.folder.parent)):
         name, lines = f"{number:04d}", list[str]()
-        for key in _numbered(list(sequence)):
-            lines += _write_frame(key, folder, name)
+        for run, objects in _numbered(sequence):
+            lines += _write_frame(run, objects, folder, name)
         write_file(folder / "label_02" / f"{name}.txt", "".join(lines).encode())
 
 
-def _write_frame(key: _KeyObjects, folder: Path, sequence: str) -> list[str]:
+def _write_frame(run: FinishedRun, objects: _Objects, folder: Path, sequence: str) -> list[str]:
     """Write the files of a key, and return its label lines; ``sequence`` is the sequence's name."""
-    run, file = key.run, f"{key.run.key:06d}"
-    map_name = run.cameras[0]
-    view = run.views[map_name]
+    file, map_name = f"{run.key:06d}", run.cameras[0]
+    view = run.scene.views[map_name]
     if not view.camera.is_rectified:
         raise InputError(
             f"{map_name}: its images have distortion, and KITTI's are rectified; name a rectified "
             f"camera with --camera"
         )
-    cloud = StoredCloud.joined([run.cloud(), *run.mover_clouds()]).sweep(run.key)
+    cloud = run.whole_cloud().sweep(run.key)
     table = np.column_stack([cloud.rigid_points, cloud.intensity]).astype("<f4")
     write_file(folder / "velodyne" / sequence / f"{file}.bin", table.tobytes())
     if (jpeg := run.jpeg(map_name)) is not None:
         image = encode_png(decode_image(jpeg, run.folder))
         write_file(folder / "image_02" / sequence / f"{file}.png", image)
-    write_file(folder / "calib" / f"{sequence}.txt", _calibration(view).encode())
+    P = np.hstack([view.camera.K, np.zeros((3, 1))])  # of rectified camera 0 and image_02 too
+    calibration = {f"P{n}": P for n in range(4)}
+    calibration |= {"R_rect": np.eye(3), "Tr_velo_cam": view.camera.T_cam_lidar[:3]}
+    calibration |= {"Tr_imu_velo": np.eye(4)[:3]}
+    rows = (
+        f"{name}: {' '.join(f'{x:.12e}' for x in values.ravel())}\n"
+        for name, values in calibration.items()
+    )
+    write_file(folder / "calib" / f"{sequence}.txt", "".join(rows).encode())
     lines = []
-    for number, track in key.tracks.items():
+    for number, track in objects.items():
         T_cam_object = view.camera.T_cam_lidar @ _measured_pose(track, run.key, cloud)
         if label := _label(track.size_m, T_cam_object, view):
             lines.append(f"{run.key} {number} {label}\n")
     return lines
-
-
-def _calibration(view: CameraView) -> str:
-    """Return the calibration file of a camera, which is rectified camera 0 and image_02 too."""
-    P = np.hstack([view.camera.K, np.zeros((3, 1))])
-    entries = {f"P{n}": P for n in range(4)}
-    entries |= {"R_rect": np.eye(3), "Tr_velo_cam": view.camera.T_cam_lidar[:3]}
-    entries |= {"Tr_imu_velo": np.eye(4)[:3]}
-    return "".join(
-        f"{name}: {' '.join(f'{x:.12e}' for x in np.ravel(values))}\n"
-        for name, values in entries.items()
-    )
 
 
 def _measured_pose(track: ObjectTrack, key: int, cloud: StoredCloud) -> Float:
@@ -234,36 +197,37 @@ def _type_of(size_m: Float) -> str:
     return "Truck" if length_m > _CAR_M or height_m > _TALL_M else "Car"
 
 
-def _numbered(runs: Sequence[FinishedRun]) -> list[_KeyObjects]:
+def _numbered(runs: Iterable[FinishedRun]) -> list[tuple[FinishedRun, _Objects]]:
     """Return the objects of each key, with track numbers and sizes of the whole sequence."""
-    keys = list[_KeyObjects]()
+    keys = list[tuple[FinishedRun, _Objects]]()
     tracks_of: dict[int, list[ObjectTrack]] = {}
     for run in runs:
-        earlier_numbers = _earlier_numbers(run, keys)
-        tracks = dict[int, ObjectTrack]()
+        earlier_numbers, objects = _earlier_numbers(run, keys), _Objects()
         for row, track in enumerate(run.tracks):
             number = earlier_numbers.get(row, len(tracks_of))
-            tracks[number] = track
+            objects[number] = track
             tracks_of.setdefault(number, []).append(track)
-        keys.append(_KeyObjects(run, tracks))
+        keys.append((run, objects))
     return [
-        _KeyObjects(run, {n: _sized(track, tracks_of[n]) for n, track in tracks.items()})
-        for run, tracks in keys
+        (run, {number: _sized(track, tracks_of[number]) for number, track in objects.items()})
+        for run, objects in keys
     ]
 
 
-def _earlier_numbers(run: FinishedRun, keys: Sequence[_KeyObjects]) -> dict[int, int]:
+def _earlier_numbers(
+    run: FinishedRun, keys: Sequence[tuple[FinishedRun, _Objects]]
+) -> dict[int, int]:
     """Return index of a track of the run -> number of the same object in earlier keys."""
     candidates: list[tuple[float, int, int]] = []
-    for key in keys:  # tracks must overlap in time and space
-        T_now, T_then = run.scene.T_key_lidar, key.run.scene.T_key_lidar
+    for earlier_run, objects in keys:  # tracks must overlap in time and space
+        T_now, T_then = run.scene.T_key_lidar, earlier_run.scene.T_key_lidar
         shared = sorted(T_now.keys() & T_then.keys())
         if not shared:
             continue
         frame = shared[len(shared) // 2]
         T_run_key = T_now[frame] @ poses.inverse(T_then[frame])
         for row, track in enumerate(run.tracks):
-            for number, earlier in key.tracks.items():
+            for number, earlier in objects.items():
                 distance_m = _distance_m(track, earlier, T_run_key)
                 diagonal_m = min(float(np.hypot(*t.size_m[:2])) for t in (track, earlier))
                 if distance_m < diagonal_m / 2:
@@ -298,8 +262,7 @@ def _sized(track: ObjectTrack, of_object: Sequence[ObjectTrack]) -> ObjectTrack:
         size_m = float(np.median(complete_m)) if complete_m else longest_m
         missing_m = size_m - track.size_m[axis]
         is_unseen = np.array([end not in track.sides_seen for end in ends])
-        is_one_sided = is_unseen.any() and not is_unseen.all()
-        share = is_unseen if is_one_sided else np.array([0.5, 0.5])
+        share = is_unseen if is_unseen.sum() == 1 else np.array([0.5, 0.5])
         track = grow_box(track, axis, *(missing_m * share))
     return track
 
@@ -314,4 +277,4 @@ def write_readme(root: Path, method: str, window: int, settings: Mapping[str, An
         sweeps=2 * window + 1,
         settings=yaml.safe_dump(plain(settings), sort_keys=False, allow_unicode=True).rstrip(),
     )
-    write_file(root / README, text.encode())
+    write_file(root / "README.txt", text.encode())

@@ -62,20 +62,13 @@ def order_front_first(
         travel_m = T_key_lidar[frames[-1]][:3, 3] - T_key_lidar[frames[0]][:3, 3]
     if np.linalg.norm(travel_m) >= _MIN_TRAVEL_M:
         # Row z of a camera's rotation is its optical axis in the key frame.
-        ahead = [
-            float(views[name].T_cam_key[2, :3] @ travel_m) if name in views else -np.inf
-            for name in names
-        ]
+        axes = (views[name].T_cam_key[2, :3] if name in views else None for name in names)
+        ahead = [-np.inf if axis is None else float(axis @ travel_m) for axis in axes]
     else:
         # "front" counts more than a word such as "left" in the same name.
         ahead = [float("front" in name.lower()) - 0.5 * bool(_SIDE.search(name)) for name in names]
     first = int(np.argmax(ahead)) if len(names) else 0
     return [*names[first : first + 1], *names[:first], *names[first + 1 :]]
-
-
-def write_key_figure(result: Result, folder: Path) -> None:
-    """Write ``figure.png``: the maps of the baselines from top to bottom, then the result's."""
-    write_figure(folder / "figure.png", {**result.baselines, result.method: result})
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
@@ -262,7 +255,14 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
     for number, (title, methods) in enumerate(curves.items(), 1):
         axes = figure.add_subplot(rows, columns, number)
         for color, (method, curve) in enumerate(methods.items()):
-            _draw_curve(axes, method, curve, f"C{color}")
+            for product, width in (("measured", 1.0), ("filled", 2.5)):
+                points = _percentages(curve, product, "outliers")
+                label = f"{METHOD_NAMES.get(method, method)}, {product}"
+                if points:
+                    density, outliers = points[0]
+                    label += f": {density:.1f} % of pixels, {outliers:.2f} % outliers"
+                style = dict[str, Any](color=f"C{color}", linewidth=width, markersize=1 + 2 * width)
+                axes.plot(*np.reshape(points, (-1, 2)).T, "o-", label=label, **style)
         last = [*methods.values()][-1]
         if expected := _percentages(last, "filled", "expected"):
             axes.plot(*zip(*expected, strict=True), "k--", label="expected by confidence")
@@ -274,18 +274,6 @@ def draw_curves(curves: Mapping[str, Mapping[str, Curve]]) -> Figure:
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
     return figure
-
-
-def _draw_curve(axes: Any, method: str, curve: Curve, color: str) -> None:
-    """Draw a method's outliers over density: a thin line if measured, a thick one if filled."""
-    for product, width in (("measured", 1.0), ("filled", 2.5)):
-        points = _percentages(curve, product, "outliers")
-        label = f"{METHOD_NAMES.get(method, method)}, {product}"
-        if points:
-            density, outliers = points[0]
-            label += f": {density:.1f} % of pixels, {outliers:.2f} % outliers"
-        x_y = zip(*points, strict=True) if points else ((), ())
-        axes.plot(*x_y, "o-", color=color, label=label, linewidth=width, markersize=1 + 2 * width)
 
 
 def _percentages(curve: Curve, product: str, score: str) -> list[tuple[float, float]]:

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from densify.config.errors import InputError
 from densify.config.file_content import read_json, read_yaml
@@ -32,12 +32,8 @@ _FOLDER_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 _MOST_READABLE = 80  # letters of a name that a hash makes unique
 
 
-class _Stored(NamedTuple):
-    """The recording of a result, as its file says."""
-
-    file: Path  # file that names the recording
-    recording: str  # name of the recording
-    data: str  # text of ``--data``, "" if the file lacks it
+_Stored = tuple[Path, str, str]
+"""File that names the recording of a result, the recording's name, and its text of ``--data``."""
 
 
 def split_of(recording: str) -> Split:
@@ -66,12 +62,12 @@ def default_folder(recording: str) -> Path:
 def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = ()) -> None:
     """Raise InputError if a folder holds results of another recording, by `is_same`."""
     for result in _stored_results(out, keys):
-        if not any(is_same(recording, data, stored.recording, stored.data) for stored in result):
-            stored = result[0]
-            source = f" ({stored.data})" if stored.data else ""
+        if not any(is_same(recording, data, *stored) for _, *stored in result):
+            path, stored_recording, stored_data = result[0]
+            source = f" ({stored_data})" if stored_data else ""
             raise InputError(
-                f"--out {out}: {stored.file.relative_to(out)} is of another recording, "
-                f"{stored.recording}{source}; got {recording} ({data}); choose another --out DIR"
+                f"--out {out}: {path.relative_to(out)} is of another recording, "
+                f"{stored_recording}{source}; got {recording} ({data}); choose another --out DIR"
             )
 
 
@@ -88,31 +84,31 @@ def is_same(recording: str, data: str, stored_recording: str, stored_data: str) 
 
 def _stored_results(out: Path, keys: Iterable[int]) -> Iterator[list[_Stored]]:
     """Yield the recordings of each result in a folder: a training set, keys, files of flow."""
-    drives = _mapping(out / "dataset.json").get("drives")
-    if isinstance(drives, Mapping) and drives:
-        yield [_stored(out / "dataset.json", name, drive) for name, drive in drives.items()]
+    path = out / "dataset.json"
+    if drives := _mapping(_content(path).get("drives")):
+        yield [
+            (path, name, str(_mapping(drive).get("data") or "")) for name, drive in drives.items()
+        ]
     folders = sorted(path for path in out.glob("[0-9]*") if path.is_dir())
     # The first key, the last one, and those to be written
     for folder in sorted({*folders[:1], *folders[-1:], *(out / f"{key:06d}" for key in keys)}):
         for path in (folder / "run.yaml", folder / "compare.json"):
-            if name := (table := _mapping(path)).get("recording"):
-                yield [_stored(path, name, table)]
+            if name := (table := _content(path)).get("recording"):
+                yield [(path, str(name), str(table.get("data") or ""))]
     for path in sorted(out.glob("[0-9]*_[0-9]*.npz"))[:1]:
         with suppress(InputError):
             if "recording" in (arrays := read_arrays(path, ("recording",))):
-                yield [_Stored(path, str(arrays["recording"]), "")]
+                yield [(path, str(arrays["recording"]), "")]
 
 
-def _stored(path: Path, name: Any, table: Any) -> _Stored:
-    """Return the recording that a file names; ``table`` holds the text of ``--data``."""
-    data = table.get("data") if isinstance(table, Mapping) else None
-    return _Stored(path, str(name), str(data or ""))
-
-
-def _mapping(path: Path) -> Mapping[str, Any]:
-    """Return the content of a YAML or JSON file, {} if it is missing or damaged."""
-    content: Any = None
+def _content(path: Path) -> Mapping[str, Any]:
+    """Return the mapping in a YAML or JSON file, {} if it is missing or damaged."""
     with suppress(InputError):
         if path.is_file():
-            content = read_yaml(path)[0] if path.suffix == ".yaml" else read_json(path)
-    return content if isinstance(content, Mapping) else {}
+            return _mapping(read_yaml(path)[0] if path.suffix == ".yaml" else read_json(path))
+    return {}
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    """Return a value if it is a mapping, else an empty one."""
+    return value if isinstance(value, Mapping) else {}

@@ -43,17 +43,11 @@ _MAPS: Mapping[str, PixelType] = {
     "scene/sweep": np.uint16,
     "scene/reason": np.uint8,
 }
-_NOT_OF_METHODS = {"depth", "depth_filled", "confidence", "age", "sweep", "reason", "truth"}
 _SCRIPTS = (
     *("unpack.js", "dom.js", "colours.js", "maps.js", "matrices.js", "gl.js", "cloud.js"),
     *("scores.js", "key.js"),
 )
-_COLOUR_MAPS = {
-    "viridis": cv2.COLORMAP_VIRIDIS,
-    "cividis": cv2.COLORMAP_CIVIDIS,
-    "inferno": cv2.COLORMAP_INFERNO,
-    "turbo": cv2.COLORMAP_TURBO,
-}
+_COLOUR_MAPS = ("viridis", "cividis", "inferno", "turbo")
 _TRIAL_EFFORT, _EFFORT = 1, 7  # effort of compression, for the comparison and for the page
 _SOURCE_BITS = 17  # bits of a pixel's code below its sweep: age (16), and measured or filled (1)
 _MAX_UINT16 = 65535
@@ -125,14 +119,11 @@ class KeyFiles:
                 maps[kind] = image
         return maps
 
-    def image(self, name: str) -> bytes | None:
-        """Return the JPEG bytes of the image of a map, None if it is missing or damaged."""
 
-        def jpeg(path: Path) -> bytes:
-            decode_image(data := read_bytes(path), path)
-            return data
-
-        return self.read(jpeg, f"scene/image/{name}.jpg", optional=True)
+def _jpeg(path: Path) -> bytes:
+    """Return the bytes of an image file that can be decoded."""
+    decode_image(data := read_bytes(path), path)
+    return data
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:
@@ -159,20 +150,18 @@ def key_page(files: KeyFiles, shown_folder: str) -> bytes:
         if maps := files.camera(name):
             view = scene.views.get(name) if scene else None
             focal_px = view.camera.focal_px if view else None
-            cameras[name] = _packed_camera(blobs, maps, files.image(name), focal_px)
-    cloud = files.read(read_cloud, "cloud.laz")
-    packed_points = None
+            cameras[name] = {"focal_px": focal_px, **_packed_camera(blobs, maps)}
+            if (jpeg := files.read(_jpeg, f"scene/image/{name}.jpg", optional=True)) is not None:
+                cameras[name]["image"] = {"blob": blobs.keep(jpeg), "mime": "image/jpeg"}
+    cloud, packed_points = files.read(read_cloud, "cloud.laz"), None
     if not cameras and cloud is None:
         raise InputError(f"{files.maps}: no depth map and no cloud in it that can be read")
     if cloud is not None and len(cloud.points):
         frames = [sweep["frame"] for sweep in sweeps]
-        instances = [track.instance for track in tracks]
-        packed_points = pack_cloud(blobs, cloud, frames, instances)
+        packed_points = pack_cloud(blobs, cloud, frames, [track.instance for track in tracks])
 
-    about = files.about
-    methods = list(files.methods)
-    key = about.get("key")
-    data = str(about.get("data"))
+    about, methods = files.about, list(files.methods)
+    key, data = about.get("key"), str(about.get("data"))
     name = data.rstrip("/").rpartition("/")[2] or data
     page = {
         "subtitle": f"{name}, key {key}",
@@ -228,18 +217,14 @@ class Blobs:
         plain_size, step_size = (len(_deflated(values, _TRIAL_EFFORT)) for values in (array, steps))
         is_delta = step_size < plain_size
         return {
-            "blob": self._keep(_deflated(steps if is_delta else array, _EFFORT)),
+            "blob": self.keep(_deflated(steps if is_delta else array, _EFFORT)),
             "bytes": array.dtype.itemsize,
             "shape": list(array.shape),
             "delta": is_delta,
         }
 
-    def add_file(self, data: bytes, mime: str) -> dict[str, Any]:
-        """Add an image file unchanged, and return its description: ``blob`` (name) and ``mime``."""
-        return {"blob": self._keep(data), "mime": mime}
-
-    def _keep(self, data: bytes) -> str:
-        """Store bytes and return their name."""
+    def keep(self, data: bytes) -> str:
+        """Store bytes unchanged and return the name of their blob."""
         name = f"blob-{len(self.texts)}"
         self.texts[name] = base64.b64encode(data).decode()
         return name
@@ -252,33 +237,24 @@ def _deflated(array: NDArray[Any], effort: int) -> bytes:
     return zlib.compress(planes.tobytes(), effort)
 
 
-def _packed_camera(
-    blobs: Blobs, maps: Mapping[str, NDArray[Any]], jpeg: bytes | None, focal_px: float | None
-) -> dict[str, Any]:
+def _packed_camera(blobs: Blobs, maps: dict[str, NDArray[Any]]) -> dict[str, Any]:
     """Pack the maps of `KeyFiles.camera` into ``blobs`` and return the camera's entry."""
     nothing = np.zeros_like(next(iter(maps.values())), np.uint16)
     depth, filled, sweep, age = (
-        maps.get(kind, nothing) for kind in ("depth", "depth_filled", "sweep", "age")
+        maps.pop(kind, nothing) for kind in ("depth", "depth_filled", "sweep", "age")
     )
+    shown = {kind: maps.pop(kind) for kind in ("confidence", "reason", "truth") if kind in maps}
     measured = depth > 0
     codes = (sweep.astype(np.int64) << _SOURCE_BITS) | (age.astype(np.int64) << 1) | measured
     known, source = np.unique(codes, return_inverse=True)
-    entry: dict[str, Any] = {
-        "focal_px": focal_px,
+    return {
         "filled": blobs.add(np.where(measured, depth, filled)),
         "source": blobs.add(source.reshape(codes.shape)),
         "sources": np.stack([known >> _SOURCE_BITS, (known >> 1) & _MAX_UINT16, known & 1], axis=1),
         "density": {"measured": np.mean(measured), "filled": np.mean(filled > 0)},
-        "others": {
-            kind: blobs.add(values) for kind, values in maps.items() if kind not in _NOT_OF_METHODS
-        },
+        "others": {kind: blobs.add(values) for kind, values in maps.items()},
+        **{kind: blobs.add(values) for kind, values in shown.items()},
     }
-    entry |= {
-        kind: blobs.add(maps[kind]) for kind in ("confidence", "reason", "truth") if kind in maps
-    }
-    if jpeg is not None:
-        entry["image"] = blobs.add_file(jpeg, "image/jpeg")
-    return entry
 
 
 def pack_cloud(
@@ -287,12 +263,10 @@ def pack_cloud(
     """Pack a thinned cloud into ``blobs`` and return its entry in the page, moving points first.
 
     ``frames`` are the sweeps of the page, ``instances`` the numbers of its tracked objects.
-
-    Returns:
-        The entry. Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices
-            in ``frames``. ``mover`` is 0 for static points, 1 for moving points without a track, 2
-            and up for tracked objects by ``instances``. ``displaced``, for moving points only, is
-            32768 plus the displacement beyond rigid alignment in steps of ``displaced_step_m``.
+    Positions are ``low_m`` + ``step_m`` times 16-bit integers. ``sweep`` has indices in ``frames``.
+    ``mover`` is 0 for static points, 1 for moving points without a track, 2 and up for tracked
+    objects by ``instances``. ``displaced``, for moving points only, is 32768 plus the displacement
+    beyond rigid alignment in steps of ``displaced_step_m``.
     """
     rows = thin_cloud(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
@@ -334,9 +308,8 @@ def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
     """Return (N,3) colours of 64 levels, gray by reflectance where no camera observed the point."""
     dark, bright = _GRAY
     gray = dark + (bright - dark) * np.sqrt(np.clip(cloud.intensity, 0, 1))
-    return (
-        np.where(cloud.observed[:, None], cloud.rgb, gray[:, None]).astype(np.uint8) >> _COLOUR_BITS
-    ).astype(np.uint8)
+    rgb = np.where(cloud.observed[:, None], cloud.rgb, gray[:, None]).astype(np.uint8)
+    return rgb >> np.uint8(_COLOUR_BITS)
 
 
 def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
@@ -356,18 +329,24 @@ def page_file(title: str, data: Mapping[str, Any], blobs: Blobs) -> bytes:
         f"default-src 'none'; script-src {_hash(script)}; style-src {_hash(style)}; "
         f"img-src data: blob:; base-uri 'none'; form-action 'none'"
     )
-    blanks = {
+    texts = (
+        f'<script type="text/plain" id="{name}">{text}</script>'
+        for name, text in blobs.texts.items()
+    )
+    parts = {
         "csp": policy,
         "title": html.escape(title),
         "style": style,
         "script": script,
         "data": _json({**data, "palettes": _palettes()}),
-        "blobs": "\n".join(
-            f'<script type="text/plain" id="{name}">{text}</script>'
-            for name, text in blobs.texts.items()
-        ),
+        "blobs": "\n".join(texts),
     }
-    filled = re.sub(r"\{\{(\w+)\}\}", lambda match: blanks[match[1]], _source("key.html"))
+    return fill_template("key.html", parts)
+
+
+def fill_template(name: str, parts: Mapping[str, str]) -> bytes:
+    """Return the bytes of a file of the folder ``page`` with ``parts`` for each {{NAME}}."""
+    filled = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _source(name))
     return filled.encode("utf-8", "backslashreplace")
 
 
@@ -389,9 +368,8 @@ def _json(value: Mapping[str, Any]) -> str:
 
 def _palettes() -> dict[str, str]:
     """Return the name of each colour map -> 256 RGB colours in base64."""
-    levels = np.arange(256, dtype=np.uint8)
-    maps = {name: cv2.applyColorMap(levels, number) for name, number in _COLOUR_MAPS.items()}
-    return {
-        name: base64.b64encode(bgr.reshape(256, 3)[:, ::-1].tobytes()).decode()
-        for name, bgr in maps.items()
-    }
+    palettes, levels = {}, np.arange(256, dtype=np.uint8)
+    for name in _COLOUR_MAPS:
+        bgr = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))
+        palettes[name] = base64.b64encode(bgr.reshape(256, 3)[:, ::-1].tobytes()).decode()
+    return palettes

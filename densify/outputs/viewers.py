@@ -33,6 +33,15 @@ _MOST_WIDTH_PX = 1280
 _POINT, _SWEEP_POINT = -1.5, -2.5  # radii in points of the screen, as rerun writes them
 
 
+class ShownBox(NamedTuple):
+    """The box of a moving object at one time."""
+
+    instance: int  # number of the object
+    T_key_object: Float  # (4,4) pose in the key sweep's lidar frame
+    size_m: Float  # (3,) length, width and height
+    speed_m_s: float
+
+
 class ShownSweep(NamedTuple):
     """A sweep as measured, for display, with its registered pose."""
 
@@ -41,15 +50,6 @@ class ShownSweep(NamedTuple):
     T_key_lidar: Float  # (4,4) pose in the key sweep's lidar frame
     points: StoredCloud  # points of the sweep. ``points.rigid_points`` are the measured positions.
     boxes: list[ShownBox]  # boxes of the moving objects at the sweep's time
-
-
-class ShownBox(NamedTuple):
-    """The box of a moving object at one time."""
-
-    instance: int  # number of the object
-    T_key_object: Float  # (4,4) pose in the key sweep's lidar frame
-    size_m: Float  # (3,) length, width and height
-    speed_m_s: float
 
 
 class Shot(NamedTuple):
@@ -67,13 +67,11 @@ class Timeline(NamedTuple):
     """All that a viewer shows of one densified key sweep: cloud, sweeps and camera images."""
 
     key: int  # frame number of the key sweep
-    # (4,4) pose of the key sweep. The world is the first key sweep's lidar frame.
-    T_world_key: Float
+    T_world_key: Float  # (4,4) pose. The world is the first key sweep's lidar frame.
     cloud: StoredCloud  # accumulated points at the key sweep's time, key sweep's lidar frame
-    # Sweeps of the window as measured, ascending in time; the key sweep alone if the viewer shows
-    # several runs
+    # Sweeps of the window, ascending in time; of several runs, the key sweeps alone
     sweeps: list[ShownSweep]
-    shots: list[Shot]  # camera images with their depth maps, one `Shot` for each chosen map
+    shots: list[Shot]  # one for each chosen map
     tracks: list[ObjectTrack]  # moving objects
 
 
@@ -87,7 +85,7 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
                 stamp_ns = run.stamp_ns + round(_NS * (since_s or 0.0))
                 points, boxes = cloud.sweep(frame), _boxes_at(run.tracks, frame)
                 sweeps.append(ShownSweep(frame, stamp_ns, np.array(T), points, boxes))
-        shots = [_shot(run, name) for name in run.views]
+        shots = [_shot(run, name) for name in run.scene.views if name in run.cameras]
         yield Timeline(run.key, T_world_key, cloud, sweeps, shots, run.tracks)
 
 
@@ -98,18 +96,22 @@ def _boxes_at(tracks: Sequence[ObjectTrack], frame: int) -> list[ShownBox]:
         if frame in track.frames:
             row = track.frames.index(frame)
             speed_m_s = float(np.linalg.norm(track.velocity_m_s[row]))
-            pose = track.T_key_object[row]
-            boxes.append(ShownBox(track.instance, pose, track.size_m, speed_m_s))
+            boxes.append(ShownBox(track.instance, track.T_key_object[row], track.size_m, speed_m_s))
     return boxes
 
 
 def _shot(run: FinishedRun, name: str) -> Shot:
     """Return the image of a map with its depth."""
-    view, maps = run.views[name], run.maps(name)
+    view, maps = run.scene.views[name], run.maps(name)
     stamp_ns = run.stamp_ns + round(_NS * view.late_s)
     maps_m = {kind: metres(maps[kind]) for kind in ("depth", "depth_filled")}
     is_pinhole = view.camera.is_rectified and run.measure(name) == "z"
     return Shot(name, view, stamp_ns, run.jpeg(name), maps_m, is_pinhole)
+
+
+def _split_moving(cloud: StoredCloud) -> dict[str, StoredCloud]:
+    """Return the static and the moving points of a cloud, by the name that viewers show."""
+    return {"static": cloud.select(~cloud.moving), "moving": cloud.select(cloud.moving)}
 
 
 def write_mcap(runs: Sequence[FinishedRun], folder: Path) -> None:
@@ -159,17 +161,11 @@ class _FoxgloveMessages:
             yield "image", self._schemas.CompressedImage(**header, data=shot.jpeg, format="jpeg")
         camera = shot.view.camera
         header |= {"width": camera.width_px, "height": camera.height_px}
-        if (lens := _ros_lens(camera)) is not None:
-            model, coefficients = lens
+        if lens := _ros_lens(camera):
             P = np.hstack([camera.K, np.zeros((3, 1))])
             matrices = {"K": camera.K, "R": np.eye(3), "P": P}
             rows = {name: matrix.ravel().tolist() for name, matrix in matrices.items()}
-            yield (
-                "calibration",
-                self._schemas.CameraCalibration(
-                    **header, distortion_model=model, D=coefficients, **rows
-                ),
-            )
+            yield "calibration", self._schemas.CameraCalibration(**header, **lens, **rows)
         for kind, depth_m in shot.maps_m.items():
             pixels = {"encoding": "32FC1", "step": 4 * camera.width_px, "data": depth_m.tobytes()}
             yield kind, self._schemas.RawImage(**header, **pixels)
@@ -208,10 +204,9 @@ class _FoxgloveMessages:
             speed = schemas.KeyValuePair(key="speed", value=f"{box.speed_m_s:.2f} m/s")
             header = {"id": f"object {box.instance}", "frame_id": "key", "timestamp": stamp}
             entities.append(schemas.SceneEntity(**header, cubes=[cube], metadata=[speed]))
-        everything = schemas.SceneEntityDeletion(
-            timestamp=stamp, type=schemas.SceneEntityDeletionType.All
-        )
-        return schemas.SceneUpdate(deletions=[everything], entities=entities)
+        every = schemas.SceneEntityDeletionType.All
+        deletion = schemas.SceneEntityDeletion(timestamp=stamp, type=every)
+        return schemas.SceneUpdate(deletions=[deletion], entities=entities)
 
     def _transform(self, stamp_ns: int, parent: str, child: str, T_parent_child: Float) -> Any:
         """Return the message of a (4,4) pose."""
@@ -238,14 +233,14 @@ class _FoxgloveMessages:
         return self._schemas.Timestamp(sec=stamp_ns // _NS, nsec=stamp_ns % _NS)
 
 
-def _ros_lens(camera: Camera) -> tuple[str, list[float]] | None:
-    """Return ROS's name of the lens model and its coefficients, None if ROS has no such model."""
+def _ros_lens(camera: Camera) -> dict[str, Any]:
+    """Return ROS's name of the lens model and its coefficients, {} if ROS has no such model."""
     lens = [*camera.distortion]
     if camera.model == "fisheye":
-        return "kannala_brandt", lens
+        return {"distortion_model": "kannala_brandt", "D": lens}
     if camera.model != "pinhole" or len(lens) not in _ROS_LENSES:
-        return None
-    return _ROS_LENSES[len(lens)], lens + [0.0] * (5 - len(lens))
+        return {}
+    return {"distortion_model": _ROS_LENSES[len(lens)], "D": lens + [0.0] * (5 - len(lens))}
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
@@ -278,11 +273,11 @@ def _log_to_rerun(stream: Any, runs: Sequence[FinishedRun]) -> None:
     import rerun as rr
 
     stream.log("world", rr.ViewCoordinates.FLU, static=True, strict=True)
-    entities = (entity for timeline in timelines(runs) for entity in _rerun_entities(timeline))
-    for frame, stamp_ns, name, shown in entities:
-        stream.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
-        stream.set_time("frame", sequence=frame)
-        stream.log(f"{_KEY}/{name}".rstrip("/"), shown, strict=True)
+    for timeline in timelines(runs):
+        for frame, stamp_ns, name, shown in _rerun_entities(timeline):
+            stream.set_time("time", timestamp=np.datetime64(stamp_ns, "ns"))
+            stream.set_time("frame", sequence=frame)
+            stream.log(f"{_KEY}/{name}".rstrip("/"), shown, strict=True)
 
 
 def _rerun_entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
@@ -294,8 +289,7 @@ def _rerun_entities(timeline: Timeline) -> Iterator[tuple[int, int, str, Any]]:
 
     cloud, start = timeline.cloud, (timeline.sweeps[0].frame, timeline.sweeps[0].stamp_ns)
     yield *start, "", _rerun_pose(timeline.T_world_key)
-    for name, keep in (("static", ~cloud.moving), ("moving", cloud.moving)):
-        group = cloud.select(keep)
+    for name, group in _split_moving(cloud).items():
         yield *start, f"cloud/{name}", points(group.points, group, _POINT)
     paths = [track.T_key_object[:, :3, 3] for track in timeline.tracks]
     yield *start, "movers/path", rr.LineStrips3D(paths)
@@ -346,9 +340,7 @@ def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
     """Show points and boxes, with a time line of several runs, until the window is closed."""
     o3d, shown = import_extra("open3d", "open3d", "Windows with the cloud"), []
     for time, timeline in enumerate(timelines(runs)):
-        cloud = timeline.cloud
-        for group, keep in (("static", ~cloud.moving), ("moving", cloud.moving)):
-            points = cloud.select(keep)
+        for group, points in _split_moving(timeline.cloud).items():
             geometry = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.points))
             geometry.colors = o3d.utility.Vector3dVector(points.shown_rgb / 255)
             geometry.transform(timeline.T_world_key)
@@ -370,11 +362,13 @@ def show_in_open3d(runs: Sequence[FinishedRun]) -> None:
 
 def write_mp4(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``video/CAMERA.mp4`` with a frame for each map, in the order of runs and images."""
-    shots = [(run, name) for run in runs for name in run.cameras]
+    shots: dict[str, list[tuple[FinishedRun, str]]] = {}
+    for run in runs:
+        for name in run.cameras:
+            shots.setdefault(name.partition("/")[0], []).append((run, name))
     (folder / "video").mkdir()
-    for camera in dict.fromkeys(name.partition("/")[0] for _, name in shots):
+    for camera, of_camera in shots.items():
         path = folder / "video" / f"{camera}.mp4"
-        of_camera = [(run, name) for run, name in shots if name.partition("/")[0] == camera]
         pictures = (_picture(run, name) for run, name in of_camera)
         first = next(pictures)
         size_px = first.shape[1], first.shape[0]
