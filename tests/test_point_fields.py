@@ -25,8 +25,8 @@ DRIVERS = {  # names: those of intensity, time, ring
 @pytest.mark.parametrize("names", DRIVERS)
 def test_fields_of_drivers(names: str) -> None:
     fields = find_fields(names.split())
-    assert (fields.intensity, fields.time, fields.ring) == DRIVERS[names]
-    assert [fields.x.lower(), fields.y.lower(), fields.z.lower()] == ["x", "y", "z"]
+    assert tuple(fields.get(key, "") for key in ("intensity", "time", "ring")) == DRIVERS[names]
+    assert [fields[axis].lower() for axis in "xyz"] == ["x", "y", "z"]
 
 
 TIMES = {  # values, unit, absolute

@@ -98,7 +98,7 @@ def test_formats_with_names_agree(name: str, tmp_path: Path) -> None:
     if path.suffix == ".ply":
         pytest.importorskip("trimesh")
     WRITERS[name](path)
-    columns = read_table(path).columns
+    columns = read_table(path)
     read = np.stack([columns[axis] for axis in "xyz"], axis=1)
     np.testing.assert_allclose(read, POINTS, atol=0.0006 if "one" in name else 0)
     np.testing.assert_array_equal(columns["intensity"], INTENSITY)
@@ -120,13 +120,13 @@ def test_columns_without_names_are_named_in_order(name: str, tmp_path: Path) -> 
     else:
         np.savetxt(path, table, "%.9g", "," if path.suffix == ".csv" else " ")
     names = ("x", "y", "z", "reflectance", "ring")
-    columns = read_table(path, names).columns
+    columns = read_table(path, names)
     assert tuple(columns) == names
     np.testing.assert_allclose(np.stack([*columns.values()], axis=1), table, rtol=1e-7)
     with pytest.raises(InputError, match=r"expected 7: x y z|multiple of 28"):
         read_table(path, (*names, "sixth", "seventh"))
     if path.suffix != ".bin":
-        assert tuple(read_table(path).columns) == ("x", "y", "z", "intensity", "column4")
+        assert tuple(read_table(path)) == ("x", "y", "z", "intensity", "column4")
 
 
 def cut(path: Path, num_bytes: int) -> None:
@@ -182,7 +182,7 @@ def test_damaged_files_are_refused_in_a_line(name: str, harm, says: str, tmp_pat
 )
 def test_tables_of_every_habit(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(text.encode())
-    columns = {name.lower(): c for name, c in read_table(tmp_path / "a.csv").columns.items()}
+    columns = {name.lower(): c for name, c in read_table(tmp_path / "a.csv").items()}
     assert np.array_equal(columns["x"], [1, 4]) and np.array_equal(columns["z"], [3, 6])
     assert columns["y"][0] == 2 and np.isnan(columns["y"][1])
 
@@ -241,7 +241,7 @@ def test_the_error_of_five_columns_holds_the_setting_that_reads_them(
 
 def test_columns_of_nuscenes_are_recognised(test_data: Path) -> None:
     (path,) = (test_data / "nuscenes/samples/LIDAR_TOP").iterdir()
-    columns = read_table(path).columns
+    columns = read_table(path)
     assert list(columns) == ["x", "y", "z", "intensity", "ring"]
     rows = np.fromfile(path, "<f4").reshape(-1, 5)
     np.testing.assert_array_equal(np.column_stack([*columns.values()]), rows)
@@ -260,7 +260,7 @@ def test_as_many_columns_as_size_and_values_say(
         rows[:, 4], rows[:, 5] = rng.uniform(0, 1.5, num_points), 1_550_083_467_346_370
     rows = rows[:, :num_columns].astype("<f4")
     rows.tofile(tmp_path / "a.bin")
-    columns = read_table(tmp_path / "a.bin").columns
+    columns = read_table(tmp_path / "a.bin")
     assert list(columns) == names
     np.testing.assert_array_equal(np.column_stack([*columns.values()]), rows)
 
@@ -270,7 +270,7 @@ def test_organised_arrays_are_read(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", image)
     np.savez(tmp_path / "a.npz", points=ROWS.reshape(6, 10))
     for name in ("a.npy", "a.npz"):
-        columns = read_table(tmp_path / name).columns
+        columns = read_table(tmp_path / name)
         read = np.stack([columns[axis] for axis in "xyz"], axis=1)
         np.testing.assert_array_equal(read, POINTS)
         np.testing.assert_array_equal(columns["intensity"], INTENSITY)
@@ -283,7 +283,7 @@ def test_byte_order_marks_are_skipped_and_utf_16_is_named(tmp_path: Path) -> Non
     path = tmp_path / "words.pcd"
     write_pcd(path, "ascii")
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    np.testing.assert_array_equal(read_table(path).columns["intensity"], INTENSITY)
+    np.testing.assert_array_equal(read_table(path)["intensity"], INTENSITY)
     for text in ("x,y,z\n1,2,3\n".encode("utf-16"), "x,y,z\n1,2,3\n".encode("utf-16-le")):
         (tmp_path / "comma.csv").write_bytes(text)
         with pytest.raises(InputError, match=r"comma\.csv: is text in UTF-16, expected UTF-8"):

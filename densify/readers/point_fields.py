@@ -46,28 +46,15 @@ _LATEST_NS = 1 << 62  # the year 2116; differences of such times fit 64 bits
 _FULL_SCALES = (1.0, 255.0, 65535.0)
 
 
-@dataclass(frozen=True)
-class Fields:
-    """Names of the point fields that hold each quantity, "" if no field does."""
-
-    x: str = ""
-    y: str = ""
-    z: str = ""
-    intensity: str = ""
-    time: str = ""
-    ring: str = ""
-    lidar: str = ""
-
-
-def find_fields(names: Collection[str]) -> Fields:
-    """Return the field of each quantity by its usual names, in any case; "" without."""
+def find_fields(names: Collection[str]) -> dict[str, str]:
+    """Return the fields by the quantities that they hold, found by usual names in any case."""
     # CloudCompare puts scalar_ before the names of fields.
     lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
-    field_of_quantity = {
-        quantity: next((lower[name] for name in aliases.split() if name in lower), "")
-        for quantity, aliases in _NAMES.items()
-    }
-    return Fields(**field_of_quantity)
+    field_of_quantity = {}
+    for quantity, aliases in _NAMES.items():
+        if known := [lower[name] for name in aliases.split() if name in lower]:
+            field_of_quantity[quantity] = known[0]
+    return field_of_quantity
 
 
 @dataclass(frozen=True)
@@ -254,10 +241,13 @@ def rescale(intensity: NDArray[Any], scale: float) -> Float32:
 class PointLayout:
     """The meaning of the fields in a sensor's sweeps."""
 
-    fields: Fields
+    fields: Mapping[str, str]  # name of the field of each quantity, as in `find_fields`
     times: PointTimes | None  # meaning of the point times, None without usable times
     time_words: str  # description of the times, or the reason why there are none
     intensity_scale: float  # divisor that scales intensities to 0 to 1
+
+    def __str__(self) -> str:
+        return ", ".join(f"{quantity} = {name}" for quantity, name in self.fields.items())
 
     @staticmethod
     def find(
@@ -280,8 +270,9 @@ class PointLayout:
             intensity_scale: Divisor of intensities that the user states, 0 to find it.
             **times: unit, absolute or reference that the user states, as in `TimeField`.
         """
-        fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
-        missing = [axis for axis in "xyz" if not getattr(fields, axis)]
+        found = find_fields(sweeps[0]) | dict(named or {})
+        fields = {quantity: found[quantity] for quantity in _NAMES if quantity in found}
+        missing = [axis for axis in "xyz" if axis not in fields]
         if missing:
             raise InputError(
                 f"{where}: no column {', '.join(missing)}: got {', '.join(sweeps[0])}; in a plain "
@@ -289,39 +280,37 @@ class PointLayout:
             )
         alike = [row for row, columns in enumerate(sweeps) if columns.keys() == sweeps[0].keys()]
         point_times, words = None, "none: no column of that kind"
-        if fields.time:
-            values = [sweeps[row][fields.time] for row in alike]
+        if "time" in fields:
+            values = [sweeps[row][fields["time"]] for row in alike]
             stamps_ns = None if stamps_ns is None else [stamps_ns[row] for row in alike]
-            field = TimeField(fields.time, **times)
+            field = TimeField(fields["time"], **times)
             point_times, words = find_times(field, values, period_ns, stamps_ns)
-        if fields.intensity and not intensity_scale:
-            intensity_scale = max(full_scale(sweeps[row][fields.intensity]) for row in alike)
+        if "intensity" in fields and not intensity_scale:
+            intensity_scale = max(full_scale(sweeps[row][fields["intensity"]]) for row in alike)
         return PointLayout(fields, point_times, words, intensity_scale or 1.0)
 
-    def returns(self, columns: Columns, where: Path | str, stamp_ns: int) -> tuple[Returns, Bool]:
-        """Return all N rows of a sweep, and a mask (N,) of the valid rows.
+    def returns(self, columns: Columns, where: Path | str, stamp_ns: int) -> Returns:
+        """Return all N rows of a sweep, invalid ones at 0 0 0.
 
-        Valid rows have a finite position, not 0 0 0, and a time inside the sweep; others get 0 0 0.
-        Raise InputError, whose message begins with ``where``, if a column is missing.
+        Valid rows have a finite position, not 0 0 0, and a time inside the sweep. Raise InputError,
+        whose message begins with ``where``, if a column is missing.
         """
-        missing = [name for name in vars(self.fields).values() if name and name not in columns]
+        missing = [name for name in self.fields.values() if name not in columns]
         if missing:
             raise InputError(
                 f"{where}: no column {missing[0]}, which other sweeps have; got "
                 f"{', '.join(columns)}"
             )
-        axes = (self.fields.x, self.fields.y, self.fields.z)
-        points = np.column_stack([columns[name] for name in axes]).astype(np.float64)
+        column_of = {quantity: columns[name] for quantity, name in self.fields.items()}
+        points = np.column_stack([column_of[axis] for axis in "xyz"]).astype(np.float64)
         valid: Bool = np.logical_and(np.isfinite(points).all(axis=1), points.any(axis=1))
-        if self.fields.lidar:
-            valid &= np.isfinite(columns[self.fields.lidar])
-        intensity = None
-        if self.fields.intensity:
-            intensity = rescale(columns[self.fields.intensity], self.intensity_scale)
+        if "lidar" in column_of:
+            valid &= np.isfinite(column_of["lidar"])
+        intensity = rescale(column_of.get("intensity", np.zeros(len(points))), self.intensity_scale)
         offset_ns = None
         num_untimed = 0
         if self.times is not None:
-            values = columns[self.times.field][valid]
+            values = column_of["time"][valid]
             if len(values) and (values != values[0]).any():  # else this sweep has no times
                 valid_ns, is_in_sweep = self.times.offset_ns(values, stamp_ns)
                 offset_ns = np.zeros(len(points), np.int64)
@@ -329,4 +318,4 @@ class PointLayout:
                 valid[valid] = is_in_sweep
                 num_untimed = int((~is_in_sweep).sum())
         points[~valid] = 0
-        return Returns(points, intensity, offset_ns, num_untimed=num_untimed), valid
+        return Returns(points, intensity, offset_ns, num_untimed=num_untimed)
