@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
@@ -55,11 +55,9 @@ def date_ns(text: str) -> int:
 def _epoch_unit(text: str) -> str:
     """Return the unit in which a number is a time from 2000 to 2099, "" if no unit fits."""
     for unit in UNIT_NS:
-        try:
+        with suppress(ValueError):
             if _EPOCH_NS[0] <= _to_ns(text, unit) < _EPOCH_NS[1]:
                 return unit
-        except ValueError:
-            continue
     return ""
 
 
@@ -212,10 +210,9 @@ class NamedFile(NamedTuple):
         # 1317042651468 are times since 1970.
         words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
         if unit:
-            try:
+            with suppress(ValueError):
                 return NamedFile(path, None, _to_ns(words[-1] if words else "", unit))
-            except ValueError:
-                return NamedFile(path, None, None)
+            return NamedFile(path, None, None)
         for word in reversed(words):
             epoch = _epoch_unit(word)
             # Ten digits without a fraction are a frame number, as in KITTI's file names.
@@ -225,8 +222,7 @@ class NamedFile(NamedTuple):
         return NamedFile(path, int(digits[-1]) if digits else None, None)
 
 
-@dataclass(frozen=True)
-class Series:
+class Series(NamedTuple):
     """Files of sweeps or images in the order of time."""
 
     paths: Mapping[int, Path]  # path of each file, by its number
@@ -321,10 +317,8 @@ def files_below(root: Path, suffixes: Sequence[str], depth: int) -> dict[str, li
         relative = Path(folder).relative_to(root)
         if len(relative.parts) == depth:
             subfolders.clear()
-        visible = [Path(folder, name) for name in sorted(names) if name[0] != "."]
-        paths = [
-            path for path in visible if path.suffix.lower() in suffixes and os.path.isfile(path)
-        ]
+        paths = [Path(folder, name) for name in sorted(names) if name[0] != "."]
+        paths = [path for path in paths if path.suffix.lower() in suffixes and os.path.isfile(path)]
         if paths:
             files_of_folder[relative.as_posix()] = paths
     return files_of_folder

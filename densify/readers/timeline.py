@@ -42,9 +42,8 @@ def to_runs(frames: Iterable[int]) -> list[range]:
 
 def format_frames(frames: Iterable[int]) -> str:
     """Return frame numbers as ascending text, such as ``96-135, 140``, shortened to 8 ranges."""
-    texts = [
-        f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in to_runs(sorted(frames))
-    ]
+    runs = to_runs(sorted(frames))
+    texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs]
     if len(texts) > _MOST_RANGES:
         texts = [*texts[: _MOST_RANGES - 1], "...", texts[-1]]
     return ", ".join(texts) if texts else "none"
@@ -53,10 +52,8 @@ def format_frames(frames: Iterable[int]) -> str:
 def check_window(window: int) -> None:
     """Raise InputError unless the window is a whole number of sweeps, 0 or more."""
     if isinstance(window, bool) or not isinstance(window, int | np.integer) or window < 0:
-        raise InputError(
-            f"window {window!r}: expected a whole number of sweeps on each side of the key, 0 or "
-            f"more"
-        )
+        expected = "a whole number of sweeps on each side of the key, 0 or more"
+        raise InputError(f"window {window!r}: expected {expected}")
 
 
 def check_key(key: int) -> None:
