@@ -110,29 +110,13 @@ def test_names_that_are_times(form, tmp_path):
         ("2011-09-26 13:10:51.1\n2011-09-26 13:10:51.261\n2011-09-26T13:10:51.4\n", 139_000_000),
         ("timestamp,filename\n0.3,c_3.bin\n0.1,a_1.bin\n0.2,b_2.bin\n", 100_000_000),
         ("a_1.bin 5.0\nb_2.bin 5.1\nc_3.bin 5.2\n", 100_000_000),
+        ("\ufeff0.0\r\n0.1\r\n0.2\r\n", 100_000_000),
     ],
 )
 def test_stamps_in_a_file(text, step_ns, tmp_path):
     (tmp_path / "timestamps.txt").write_text(text)
     sequence = Folder(bare(tmp_path, ["a_1.bin", "b_2.bin", "c_3.bin"]))
     assert sequence.stamp_ns(3) - sequence.stamp_ns(2) == step_ns
-
-
-def test_byte_order_marks_are_skipped(tmp_path):
-    """In every text file of the folder, with the line ends of Windows too."""
-    plain = Folder(config(bare(tmp_path / "a", ["0.bin", "1.bin"]), "sweeps: {scale_m: 2}\n"))
-    marked = bare(tmp_path / "b", ["0.bin", "1.bin"])
-    texts = {
-        "densify.yaml": "sweeps: {scale_m: 2}\n",
-        "timestamps.txt": "0.0\n0.1\n",
-        "poses.txt": "0.0 1 2 3 0 0 0 1\n0.1 1 2 4 0 0 0 1\n",
-    }
-    for name, text in texts.items():
-        (marked / name).write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    sequence = Folder(marked)
-    np.testing.assert_array_equal(sequence[0].points, plain[0].points)
-    assert sequence.stamp_ns(1) - sequence.stamp_ns(0) == 100_000_000
-    np.testing.assert_array_equal(sequence.T_world_lidar(1)[:3, 3], [1, 2, 4])
 
 
 # --- poses ----------------------------------------------------------------------------------------
@@ -267,6 +251,11 @@ def test_images_by_names_file_and_sweeps(tmp_path):
     assert sequence.image("side", 9).shape == (6, 8, 3)
     assert sequence.cameras["front"].is_rectified and sequence.cameras["rear"].model == "fisheye"
     np.testing.assert_array_equal(sequence.cameras["front"].K[:2], [[9, 0, 3.5], [0, 9, 2.5]])
+    (told,) = sequence.gaps()
+    assert told.startswith("front: 2 images without stamps beside 2 sweeps: each is taken as")
+    assert told.removeprefix("front: ") in describe(sequence) and "rates" not in told
+    bare(tmp_path / "lidar", ["3.bin"])
+    assert "if their rates differ, give the images' times" in Folder(tmp_path).gaps()[0]
 
 
 def test_the_documented_example_is_right(tmp_path):
@@ -297,6 +286,7 @@ CAMERA_EDITS = [
     ("[[0, -1, 0, 0]", "[[0.5, -1, 0, 0]", r"front\.T_cam_lidar: .*three or four rows"),
     ("fisheye, distortion: [0, 0, 0, 0]", "pinhole, distortion: [1, 2]", "0, 4, 5, 8, 12, 14 co"),
     ("files: a,", "files: nowhere,", "no images, though densify"),
+    ("size: [8, 6]", "size: [9, 6]", "got an image of 8 x 6 px; expected 9 x 6, as the calib"),
 ]
 WRONG_FILES = [
     ("timestamps.txt", "1317042661.1\n", "got 1 times for 2 files"),

@@ -282,6 +282,7 @@ BAGS = {
     "cut": (lambda: bad_cloud(data=np.zeros(99, np.uint8)), "", "got 99 bytes and rows of"),
     "encoding": (lambda: with_camera("32FC1"), RAW, "got the encoding 32FC1, expected one of rgb8"),
     "unplaced": (unplaced, RAW, "joins the camera's frame front_optical"),
+    "binned": (lambda: with_camera(info={"binning": (2, 2)}), "", "binning 2, but the images have"),
     "lens": (
         lambda: with_camera(info={"model": "ftheta", "d": [1.0]}),
         RAW,
@@ -323,6 +324,8 @@ def test_what_drivers_leave_at_zero(tmp_path):
         maker.written[-1] = maker.written[-1]._replace(log_ns=STAMP_NS + i * PERIOD_NS)
     sequence = open_sequence(maker.write(tmp_path))
     assert [sequence.stamp_ns(f) for f in (0, 1)] == [STAMP_NS, STAMP_NS + PERIOD_NS]
+    told = "/points: 2 headers have no stamp: taken is when they were recorded"
+    assert sequence.gaps() == [told]
 
 
 def test_files_compressed_as_a_whole(tmp_path):
