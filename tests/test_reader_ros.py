@@ -69,8 +69,7 @@ def test_a_livox_message(tmp_path):
     for i in range(2):
         stamp_ns = STAMP_NS + i * PERIOD_NS
         values = (maker.header(stamp_ns, "livox_frame"), stamp_ns, 100, 0, np.zeros(3, np.uint8))
-        message = maker.make(f"{package}/CustomMsg", *values, points)
-        maker.put("/livox/lidar", f"{package}/CustomMsg", message, stamp_ns)
+        maker.put("/livox/lidar", f"{package}/CustomMsg", stamp_ns, *values, points)
     sweep = open_sequence(maker.write(tmp_path))[1]
     np.testing.assert_array_equal(sweep.offset_ns, 990_000 * np.arange(100))
     np.testing.assert_allclose(sweep.points[:, 1], 0.1 * np.arange(100), rtol=1e-6)

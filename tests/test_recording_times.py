@@ -27,20 +27,16 @@ def bag(folder: Path, times: Callable[[int], np.ndarray], num: int = 7, **option
     return maker.write(folder)
 
 
-def pcd(folder: Path, times: Callable[[int], np.ndarray], num: int = 7) -> Path:
-    """A folder of numbered .pcd files with a float64 ``timestamp``."""
-    folder.mkdir(exist_ok=True)
+def folder(path: Path, times: Callable[[int], np.ndarray], num: int = 7) -> Path:
+    """A folder of numbered arrays with a float64 ``timestamp``."""
+    path.mkdir(exist_ok=True)
     rows = np.zeros(NUM, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
-    header = (
-        "VERSION 0.7\nFIELDS x y z timestamp\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-        f"WIDTH {NUM}\nHEIGHT 1\nPOINTS {NUM}\nDATA binary\n"
-    )
+    for axis in "xyz":
+        rows[axis] = scan(NUM)[axis]
     for i in range(num):
-        for axis in "xyz":
-            rows[axis] = scan(NUM)[axis]
         rows["timestamp"] = times(i)
-        (folder / f"{i:06d}.pcd").write_bytes(header.encode() + rows.tobytes())
-    return folder
+        np.save(path / f"{i:06d}.npy", rows)
+    return path
 
 
 def broken(sweep: int, share: float, time_s: float) -> Callable[[int], np.ndarray]:
@@ -118,7 +114,7 @@ def test_stamps_are_those_of_the_points_where_nothing_else_tells(tmp_path):
         at_s = 1_700_000_000 + 0.05 * i + FIRED_NS * 0.5e-9
         return np.where(np.arange(NUM) == 7, 0.0, at_s)  # one without a time
 
-    place = pcd(tmp_path / "drive", times)
+    place = folder(tmp_path / "drive", times)
     rows = [f"{1_700_000_000 + 0.05 * i:.9f} {i} 0 0 0 0 0 1" for i in range(-1, 10)]  # 20 m/s
     (place / "poses.txt").write_text("\n".join(rows))
     sequence = open_sequence(place)
@@ -139,7 +135,7 @@ def test_stamps_are_those_of_the_points_where_nothing_else_tells(tmp_path):
 )
 def test_times_since_any_epoch_are_stamps(start_s, text, reference_ns, tmp_path):
     """Of the log too; the stamp may be the end of the points' times."""
-    place = pcd(tmp_path / "drive", lambda i: start_s + 0.1 * i + FIRED_NS * 1e-9)
+    place = folder(tmp_path / "drive", lambda i: start_s + 0.1 * i + FIRED_NS * 1e-9)
     (place / "densify.yaml").write_text(text)
     sequence = open_sequence(place)
     stamps_ns = np.array([sequence.stamp_ns(f) for f in sequence.frames])
@@ -150,13 +146,13 @@ def test_times_since_any_epoch_are_stamps(start_s, text, reference_ns, tmp_path)
 
 
 def test_a_file_that_cannot_be_read_costs_its_sweep_alone(tmp_path):
-    place = pcd(tmp_path / "drive", lambda i: 1.7e9 + 0.1 * i + FIRED_NS * 1e-9)
-    (place / "000002.pcd").write_bytes(b"")
+    place = folder(tmp_path / "drive", lambda i: 1.7e9 + 0.1 * i + FIRED_NS * 1e-9)
+    (place / "000002.npy").write_bytes(b"")
     assert list(Timeline.of(open_sequence(place)).unknown) == [2]
 
 
 def test_a_rate_that_is_assumed_is_told(tmp_path):
-    place = pcd(tmp_path / "drive", lambda i: FIRED_NS * 1e-9)
+    place = folder(tmp_path / "drive", lambda i: FIRED_NS * 1e-9)
     (told,) = open_sequence(place).gaps()
     assert "no stamps: they are taken for 10 Hz by their numbers" in told
     (place / "densify.yaml").write_text("sweeps: {rate_hz: 20}")
