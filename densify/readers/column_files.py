@@ -158,7 +158,7 @@ def _pickled_columns(frame: Any) -> dict[str, NDArray[Any]]:
         raise ValueError(f"it holds a {type(frame).__name__}")
     manager_state = frame.state["_data"].state[-1]["0.14.1"]
     names = manager_state["axes"][0].args[1]["data"].state[-1]
-    columns = {}
+    columns: dict[str, NDArray[Any]] = {}
     for block in manager_state["blocks"]:
         values = _pickled_array(block["values"])
         # Numbers of the block's columns in the frame, as a slice or an array

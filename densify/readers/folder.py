@@ -33,6 +33,7 @@ from densify.readers.point_fields import Columns, PointLayout, PointTimes, sampl
 from densify.readers.point_files import SUFFIXES, read_table
 from densify.readers.recorded_poses import PoseFile, PoseTrack, transform_from_world
 from densify.readers.stamped_files import NamedFile, Series, files_below, order_files, require_path
+from densify.readers.timeline import median_period_ns
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _SEARCH_DEPTH = 2  # levels of subfolders
@@ -194,10 +195,8 @@ class Folder(FileSequence):
     @cached_property
     def _period_ns(self) -> int:
         """The median time between stamps in ns; without stamps, the period of the assumed rate."""
-        stamps_ns = list((self._sweep_stamps_ns or {}).values())
-        if len(stamps_ns) > 1:
-            return max(1, int(np.median(np.diff(stamps_ns))))
-        return round(1e9 / (self._settings.rate_hz or _ASSUMED_HZ))
+        assumed_ns = round(1e9 / (self._settings.rate_hz or _ASSUMED_HZ))
+        return median_period_ns([*(self._sweep_stamps_ns or {}).values()], assumed_ns)
 
     @cached_property
     def _layout(self) -> PointLayout:

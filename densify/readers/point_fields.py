@@ -171,10 +171,11 @@ def find_times(
         period_ns: Time between consecutive sweeps.
         stamps_ns: Stamp of each of these sweeps, None without stamps.
     """
-    finite = [values[np.isfinite(values)] for values in sweeps]
-    extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
+    timed = [row for row, values in enumerate(sweeps) if np.isfinite(values).any()]
+    finite = [sweeps[row][np.isfinite(sweeps[row])] for row in timed]
+    extents = np.array([_extent(values) for values in finite] or [(0.0, 0.0)])
     middle, reach = np.median(extents, axis=0).tolist()
-    span = max(float(np.ptp(values)) for values in finite) if any(map(len, finite)) else 0.0
+    span = max((float(np.ptp(values)) for values in finite), default=0.0)
     name, dtype = field.name, sweeps[0].dtype
 
     # Times that cannot be used: too few digits, all equal, or a span of no unit
@@ -203,8 +204,8 @@ def find_times(
 
     # The middle of the times since the stamp
     if absolute and stamps_ns is not None:
-        stamps_of_timed = [ns for ns, values in zip(stamps_ns, finite, strict=True) if len(values)]
-        middle_ns = float(np.median(middles_ns - np.array(stamps_of_timed, np.float64)))
+        timed_ns = np.array([stamps_ns[row] for row in timed], np.float64)
+        middle_ns = float(np.median(middles_ns - timed_ns))
     elif absolute:  # the stamps are made of these times
         middle_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
     point_times = PointTimes(

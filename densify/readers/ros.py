@@ -37,8 +37,8 @@ from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.point_fields import PointLayout, sample_columns
 from densify.readers.recorded_poses import PoseTrack
 from densify.readers.ros_bag import CLOUDS, IMAGES, Bag, Entry, Topic
+from densify.readers.timeline import median_period_ns
 
-_USUAL_PERIOD_NS = 100_000_000
 _FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _POSES = (_ODOMETRY, *(f"geometry_msgs/msg/Pose{kind}Stamped" for kind in ("", "WithCovariance")))
@@ -255,7 +255,7 @@ class RosBag(FileSequence):
             self._lidars.append(self._lidar(topic))
         self._image_topics: dict[str, str] = {}
         self._unusable: list[str] = []  # reasons why topics of images are left out
-        cameras = {}
+        cameras, exposed_ns = {}, {}
         for topic in topics.images:
             try:
                 camera = self._camera(topic)
@@ -266,10 +266,8 @@ class RosBag(FileSequence):
                 continue
             self._check_size(camera, topic)
             cameras[camera.name], self._image_topics[camera.name] = camera, topic
-        exposed_ns = {
-            name: {number: entry.stamp_ns for number, entry in enumerate(self._index[topic])}
-            for name, topic in self._image_topics.items()
-        }
+            stamps_ns = [entry.stamp_ns for entry in self._index[topic]]
+            exposed_ns[camera.name] = dict(enumerate(stamps_ns))
         self._stamps_ns = [entry.stamp_ns for entry in self._lidars[0].entries]
         truth = checks.truth_beside(path if path.is_dir() else path.parent)
         frames = range(len(self._stamps_ns))
@@ -305,8 +303,8 @@ class RosBag(FileSequence):
         stamp_ns = self._stamps_ns[frame]
         clouds: list[Returns] = []
         for number, lidar in enumerate(self._lidars):
-            entry = min(lidar.entries, key=lambda entry: abs(entry.stamp_ns - stamp_ns))
-            entry = entry if number else lidar.entries[frame]
+            nearest = min(lidar.entries, key=lambda entry: abs(entry.stamp_ns - stamp_ns))
+            entry = nearest if number else lidar.entries[frame]
             if abs(entry.stamp_ns - stamp_ns) <= self._lidars[0].period_ns // 2:
                 cloud = self._returns_of(lidar, entry, stamp_ns)
                 numbers = np.full(len(cloud.points), number, np.uint8)
@@ -392,8 +390,7 @@ class RosBag(FileSequence):
                 f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} to "
                 f"{first}; name the topic of one lidar: #points={topic}"
             )
-        steps_ns = np.diff([entry.stamp_ns for entry in entries])
-        period_ns = max(1, int(np.median(steps_ns))) if len(steps_ns) else _USUAL_PERIOD_NS
+        period_ns = median_period_ns([entry.stamp_ns for entry in entries])
         stamps_ns = [entry.stamp_ns for entry in columns_of_entry]
         layout = PointLayout.find([*columns_of_entry.values()], where, period_ns, stamps_ns)
         return Lidar(topic, frame, bool(placed_frame), entries, T, period_ns, layout)

@@ -18,7 +18,11 @@ from densify.geometry.types import Camera, Int, LidarSequence, Sweep, Trajectory
 
 _HOLE_PERIODS = 3.1  # a longer step is a hole in time: 3 periods and some jitter
 _MOST_RANGES = 8
-_NOMINAL_PERIOD_NS = 100_000_000  # period of a recording with one sweep
+
+
+def median_period_ns(stamps_ns: Sequence[int] | Int, default_ns: int = 100_000_000) -> int:
+    """Return the median time (ns) between consecutive stamps, the default for a single stamp."""
+    return max(1, int(np.median(np.diff(stamps_ns)))) if len(stamps_ns) > 1 else default_ns
 
 
 class WindowFrames(NamedTuple):
@@ -104,9 +108,7 @@ class Timeline:
     @cached_property
     def period_ns(self) -> int:
         """Median time between consecutive sweeps in nanoseconds; 100 ms for a single sweep."""
-        if len(self.frames) < 2:
-            return _NOMINAL_PERIOD_NS
-        return max(1, int(np.median(np.diff(self.stamp_ns))))
+        return median_period_ns(self.stamp_ns)
 
     def num_in(self, duration_s: float) -> int:
         """Return the number of sweeps in a duration in seconds at the median rate, rounded."""
