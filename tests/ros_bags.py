@@ -75,9 +75,9 @@ class Maker:
         content = (fields, big, ends[-1], data.shape[1], data.reshape(-1), False)
         self.put(topic, "sensor_msgs/msg/PointCloud2", stamp_ns + PERIOD_NS, *shape, *content)
 
-    def sweeps(self, num: int = 2, **options: Any) -> None:
+    def sweeps(self, num: int = 2, first_ns: int = STAMP_NS, **options: Any) -> None:
         for i in range(num):
-            self.cloud(scan(), STAMP_NS + i * PERIOD_NS, **options)
+            self.cloud(scan(), first_ns + i * PERIOD_NS, **options)
 
     def image(
         self,

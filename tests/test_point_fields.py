@@ -99,11 +99,12 @@ def test_what_tells_no_times_says_why(kind: str) -> None:
     assert times is None and says in words
 
 
-def test_what_is_known_is_taken() -> None:
+def test_a_unit_that_is_known_is_taken() -> None:
+    """A sweep without a time that is finite tells nothing."""
     values = np.linspace(0, 30.0, 50)
-    times, _ = find_times(TimeField("t", "ms", absolute=False), [values], PERIOD_NS, [STAMP_NS])
-    assert times is not None
-    assert times.offset_ns(values, STAMP_NS)[0][-1] == 30_000_000
+    field, sweeps = TimeField("t", "ms", absolute=False), [values, values * np.nan]
+    times, _ = find_times(field, sweeps, PERIOD_NS, [STAMP_NS, STAMP_NS + PERIOD_NS])
+    assert times is not None and times.offset_ns(values, STAMP_NS)[0][-1] == 30_000_000
 
 
 def test_intensities_are_brought_to_one() -> None:

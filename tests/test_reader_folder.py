@@ -21,7 +21,7 @@ from densify.readers.folder import Folder
 from densify.readers.folder_config import FolderConfig
 from densify.readers.street import Street
 from tests.reader_checks import check_cameras, check_refused, check_sweeps, check_truth
-from tests.test_point_files import write_pcd
+from tests.test_point_files import pcd
 
 FORMAT = "folder"
 
@@ -171,8 +171,8 @@ def test_compensation_is_undone_with_stamped_poses(tmp_path):
     stored = fired + time_s[:, None] * [10.0, 0, 0]
     bare(tmp_path, ["0.bin", "1.bin"], np.column_stack([stored, np.zeros(600), time_s]))
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n0.2 2 0 0 0 0 0 1\n")
-    text = "sweeps: {columns: [x, y, z, intensity, time], compensated: true}\n"
-    sweep = Folder(config(tmp_path, text))[0]
+    config(tmp_path, "sweeps: {columns: [x, y, z, intensity, time], compensated: true}\n")
+    sweep = Folder(tmp_path)[0]
     np.testing.assert_allclose(sweep.points, fired, atol=1e-5)
     assert sweep.offset_ns[-1] == pytest.approx(99_900_000, abs=10)
     (tmp_path / "poses.txt").unlink()
@@ -188,10 +188,8 @@ def test_sweeps_in_the_frame_of_their_poses_are_taken_back(timed, tmp_path):
     turn = Rotation.from_euler("z", 40, degrees=True)
     placed = turn.apply(fired) + (5 + time_s[:, None] * 10) * [1.0, 0, 0]
     q = " ".join(map(str, turn.as_quat()))
-    names = "x, y, z, intensity, time" if timed else "x, y, z, intensity"
-    columns = [placed, np.zeros(600), time_s] if timed else [placed, np.zeros(600)]
-    bare(tmp_path, ["0.bin", "1.bin"], np.column_stack(columns))
-    config(tmp_path, f"sweeps: {{columns: [{names}], frame: poses}}\n")
+    bare(tmp_path, ["0.bin", "1.bin"], np.column_stack([placed, time_s]))
+    config(tmp_path, "sweeps: {columns: [x, y, z, time], frame: poses}\n")
     with pytest.raises(InputError, match="there are no poses"):
         Folder(tmp_path)
     (tmp_path / "poses.txt").write_text(f"0 5 0 0 {q}\n0.1 6 0 0 {q}\n0.2 7 0 0 {q}\n")
@@ -200,19 +198,15 @@ def test_sweeps_in_the_frame_of_their_poses_are_taken_back(timed, tmp_path):
 
 def test_viewpoints_of_pcd_files_are_poses(tmp_path):
     def write(name, viewpoint):
-        write_pcd(tmp_path / name, "binary")
-        data = (tmp_path / name).read_bytes()
-        lines = re.sub(rb"VIEWPOINT [^\n]*", f"VIEWPOINT {viewpoint}".encode(), data, count=1)
+        lines = re.sub(rb"VIEWPOINT [^\n]*", f"VIEWPOINT {viewpoint}".encode(), pcd("binary"))
         (tmp_path / name).write_bytes(lines)
 
     default = "0 0 0 1 0 0 0"
     write("0.pcd", default)
-    write("1.pcd", default)
-    with pytest.raises(InputError, match="no poses"):
-        Folder(tmp_path).T_world_lidar(1)
-    write("1.pcd", "1 2 3 0 0 0 0")  # some programs write no rotation
-    with pytest.raises(InputError, match="no poses"):
-        Folder(tmp_path).T_world_lidar(1)
+    for unknown in (default, "1 2 3 0 0 0 0"):  # some programs write no rotation
+        write("1.pcd", unknown)
+        with pytest.raises(InputError, match="no poses"):
+            Folder(tmp_path).T_world_lidar(1)
     write("1.pcd", f"{PLACE} {QW} {QX} {QY} {QZ}")
     sequence = Folder(tmp_path)
     np.testing.assert_allclose(sequence.T_world_lidar(0), np.eye(4), atol=1e-12)
@@ -233,12 +227,11 @@ def cameras(folder: Path) -> Path:
     (folder / "b" / "times.csv").write_text("0.15,x9.jpg\n0.3,other.jpg\n")
     T = "[[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]"
     shared = f"size: [8, 6], K: [9, 9, 3.5, 2.5], T_cam_lidar: {T}"
-    fisheye = "stamps: sweeps, model: fisheye, distortion: [0, 0, 0, 0]"
     text = f"""sweeps: {{files: lidar, rate_hz: 20}}
 cameras:
   front: {{files: a, {shared}, clock_offset_s: 0.001}}
   side: {{files: b, {shared}}}
-  rear: {{files: c, {shared}, {fisheye}}}
+  rear: {{files: c, {shared}, stamps: sweeps, model: fisheye, distortion: [0, 0, 0, 0]}}
 """
     return config(folder, text)
 

@@ -33,27 +33,23 @@ def vlp16_payload(azimuth_cdeg: int, since_us: int) -> bytes:
     return blocks + struct.pack("<IBB", since_us, 0x37, 0x22)  # strongest return, VLP-16
 
 
-def capture(num_turns: float, order: str = "<", magic: int = 0xA1B2C3D4) -> bytes:
-    """From straight ahead on; with a packet of another kind after each fifth."""
-    data = struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 65_535, 1)
+def records(num_turns: float, order: str = "<", magic: int = 0xA1B2C3D4) -> list[bytes]:
+    """The header of a capture, then its packets: from straight ahead on, with a packet of another
+    kind after each fifth."""
+    data = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 65_535, 1)]
     unit_ns = 1000 if magic == 0xA1B2C3D4 else 1
     for i in range(int(num_turns * PACKETS_PER_TURN)):
         since_us = i * PACKET_US
         payload = vlp16_payload(round(i * 36_000 / PACKETS_PER_TURN) % 36_000, since_us)
         for packet in (payload, bytes(512))[: 2 if i % 5 == 0 else 1]:
             size, fraction = len(HEADERS + packet), since_us * 1000 // unit_ns
-            data += struct.pack(f"{order}IIII", START_S, fraction, size, size) + HEADERS + packet
+            head = struct.pack(f"{order}IIII", START_S, fraction, size, size)
+            data.append(head + HEADERS + packet)
     return data
 
 
-def packets_of(data: bytes) -> list[bytes]:
-    """The records of a little-endian capture, its file header first."""
-    records, at = [data[:24]], 24
-    while at < len(data):
-        end = at + 16 + struct.unpack_from("<I", data, at + 8)[0]
-        records.append(data[at:end])
-        at = end
-    return records
+def capture(*options) -> bytes:
+    return b"".join(records(*options))
 
 
 @pytest.fixture
@@ -94,7 +90,7 @@ def test_turns_begin_straight_behind(tmp_path, order, magic):
 
 def test_lost_and_doubled_packets_are_told_and_doubled_ones_read_once(tmp_path):
     pytest.importorskip("velodyne_decoder")
-    whole, path = packets_of(capture(2.75)), tmp_path / "drive.pcap"
+    whole, path = records(2.75), tmp_path / "drive.pcap"
     path.write_bytes(b"".join(whole))
     complete = open_sequence(f"velodyne:{path}#VLP-16")
     num_complete = len(complete[0])

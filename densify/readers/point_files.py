@@ -218,17 +218,14 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 def _pcd_header(file: Any) -> list[str]:
     """Read the header up to DATA for the parser: no padding fields, nothing optional missing."""
-    lines: list[str] = []
-    while len(lines) < 20:
+    table: dict[str, list[str]] = {}
+    while "DATA" not in table and len(table) < 20:
         raw = file.readline(65536)
         if not raw:
             raise ValueError("the header ends before DATA; it is cut off")
-        line = raw.decode("ascii", errors="strict").strip()
-        if line and not line.startswith("#"):
-            lines.append(line)
-        if line.startswith("DATA"):
-            break
-    table = {line.split()[0]: line.split()[1:] for line in lines}
+        words = raw.decode("ascii").split()
+        if words and not words[0].startswith("#"):
+            table[words[0]] = words[1:]
     missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA") if not table.get(key)]
     if missing:
         raise ValueError(f"the header has no {', '.join(missing)}")
