@@ -29,29 +29,32 @@ def test_fields_of_drivers(names: str) -> None:
     assert [fields[axis].lower() for axis in "xyz"] == ["x", "y", "z"]
 
 
-TIMES = {  # values, unit, absolute
-    "velodyne": ((FIRED_NS * 1e-9).astype("f4"), "s", False),
-    "velodyne before the stamp": ((FIRED_NS * 1e-9 - 0.1).astype("f4"), "s", False),
-    "ouster": (FIRED_NS.astype("u4"), "ns", False),
-    "microseconds": ((FIRED_NS // 1000).astype("u4"), "us", False),
-    "milliseconds": ((FIRED_NS * 1e-6).astype("f4"), "ms", False),
-    "hesai": ((STAMP_NS + FIRED_NS) * 1e-9, "s", True),
-    "robosense in us": ((STAMP_NS + FIRED_NS) // 1000, "us", True),
-    "absolute ns": ((STAMP_NS + FIRED_NS).astype("u8"), "ns", True),
-    "absolute ns as floats": ((STAMP_NS + FIRED_NS).astype("f8"), "ns", True),
+TIMES = {  # values, unit, absolute, ms of the first point after the stamp
+    "velodyne": ((FIRED_NS * 1e-9).astype("f4"), "s", False, 0),
+    "velodyne before the stamp": ((FIRED_NS * 1e-9 - 0.1).astype("f4"), "s", False, -100),
+    "around the stamp": ((FIRED_NS * 1e-9 - 0.05).astype("f4"), "s", False, -50),
+    "whole ns before the end": ((FIRED_NS - PERIOD_NS).astype("i4"), "ns", False, -100),
+    "half a revolution": ((FIRED_NS * 0.5e-9).astype("f4"), "s", False, 0),
+    "ouster": (FIRED_NS.astype("u4"), "ns", False, 0),
+    "microseconds": ((FIRED_NS // 1000).astype("u4"), "us", False, 0),
+    "milliseconds": ((FIRED_NS * 1e-6).astype("f4"), "ms", False, 0),
+    "hesai": ((STAMP_NS + FIRED_NS) * 1e-9, "s", True, 0),
+    "robosense in us": ((STAMP_NS + FIRED_NS) // 1000, "us", True, 0),
+    "absolute ns": ((STAMP_NS + FIRED_NS).astype("u8"), "ns", True, 0),
+    "absolute ns as floats": ((STAMP_NS + FIRED_NS).astype("f8"), "ns", True, 0),
 }
 
 
 @pytest.mark.parametrize("kind", TIMES)
 def test_units_follow_from_the_span(kind: str) -> None:
-    values, unit, absolute = TIMES[kind]
+    values, unit, absolute, first_ms = TIMES[kind]
     times, words = find_times(TimeField("t"), [values], PERIOD_NS, [STAMP_NS])
     assert times is not None, words
     assert (times.unit, times.absolute, times.other_clock) == (unit, absolute, False)
     assert f"t in {unit}, {'absolute' if absolute else 'relative'}" in words
     offset_ns, is_valid = times.offset_ns(values, STAMP_NS)
     assert is_valid.all() and offset_ns.dtype == np.int64
-    expected_ns = FIRED_NS - (100_000_000 if "before" in kind else 0)
+    expected_ns = FIRED_NS * (0.5 if "half" in kind else 1) + first_ms * 1e6
     assert np.abs(offset_ns - expected_ns).max() < 1200  # digits of the floats, and whole us
 
 

@@ -105,11 +105,6 @@ def test_several_lidars_make_one_sweep(tmp_path):
 T_CAM_LIDAR = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, 0.3], [0, 0, 0, 1.0]])
 PIXELS = np.random.default_rng(1).integers(0, 256, (6, 8, 3), np.uint8)
 GRAY = PIXELS[:, :, 0]
-STORED = {  # by encoding
-    "rgb8": PIXELS,
-    "bgra8": np.dstack([PIXELS[:, :, ::-1], GRAY]),
-    "mono16": GRAY.astype("<u2") * 256 + 7,
-}
 
 
 def with_cameras(*cameras):
@@ -128,11 +123,13 @@ def with_camera(encoding="rgb8", info=None):
 
 
 def test_encodings(tmp_path):
-    colour = {"r": 200, "g": 100, "b": 30}
-    stored = dict(STORED)
-    for pattern in ("rggb", "gbrg"):
-        mosaic = np.array([colour[c] for c in pattern], np.uint8).reshape(2, 2)
-        stored[f"bayer_{pattern}8"] = np.tile(mosaic, (3, 4))
+    stored = {
+        "rgb8": PIXELS,
+        "bgra8": np.dstack([PIXELS[:, :, ::-1], GRAY]),
+        "mono16": GRAY.astype("<u2") * 256 + 7,
+        "bayer_rggb8": np.tile(np.array([[200, 100], [100, 30]], np.uint8), (3, 4)),
+        "bayer_gbrg8": np.tile(np.array([[100, 30], [200, 100]], np.uint8), (3, 4)),
+    }
     cameras = [(data, encoding, f"/{encoding}/image_raw", {}) for encoding, data in stored.items()]
     sequence = open_sequence(with_cameras(*cameras).write(tmp_path))
     for encoding in stored:

@@ -75,23 +75,6 @@ def test_offsets_that_wrapped_are_left_out_of_every_sweep(tmp_path):
     assert sweep.num_untimed == 20 and sweep.offset_ns.max() == FIRED_NS[-1] - 5_000_000
 
 
-ODD = {  # what is written, ms of the first point after the stamp, and of the last one
-    "half revolutions": (lambda t: (t // 2 * 1e-9).astype("f4"), 0, 50),
-    "end-referenced": (lambda t: (t * 1e-9 - 0.1).astype("f4"), -100, 0),
-    "around the stamp": (lambda t: (t * 1e-9 - 0.05).astype("f4"), -50, 50),
-    "whole ns before the end": (lambda t: (t - PERIOD_NS).astype("i4"), -100, 0),
-}
-
-
-@pytest.mark.parametrize("kind", ODD)
-def test_odd_times_are_read_as_they_are_meant(kind, tmp_path):
-    make, first_ms, end_ms = ODD[kind]
-    sequence = open_sequence(bag(tmp_path, lambda i: make(FIRED_NS), num=3))
-    expected_ns = 1e6 * (first_ms + (end_ms - first_ms) * FIRED_NS / PERIOD_NS)
-    for frame in sequence.frames:
-        np.testing.assert_allclose(sequence[frame].offset_ns, expected_ns, atol=10)
-
-
 @pytest.mark.parametrize("height", [8, NUM // 8])
 def test_times_go_with_their_points_whatever_the_rows_are(height, tmp_path):
     """A scan of 8 rings, written ring by ring (each row goes all around) or firing by firing."""
