@@ -36,11 +36,7 @@ _SCAN, _END = b"\xff\xda", b"\xff\xd9"
 _MOST_STRAY_BYTES = 16  # wrongly decoded data often leave more, up to all of a restart interval
 _MOST_MARKERS = 512  # each takes some milliseconds
 
-# Offset of the points, number of records, bytes per point, number of points.
-_LAS_HEADER = struct.Struct("<96xIIxHI")
-# LAS 1.4 only: offset and number of extended records, number of points.
-_LAS_EXTENDED = struct.Struct("<235xQIQ")
-_RECORD_BYTES = 54  # smallest size of a variable length record
+_RECORD_BYTES = 54  # smallest size of a variable length record of a LAS file
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -247,10 +243,10 @@ def read_las(path: Path) -> Any:
 
 def _check_las(data: bytes, path: Path) -> None:
     """Raise an exception if the points, records and chunks stated in a LAS header do not fit."""
-    begin, num_records, num_bytes, num_points = _LAS_HEADER.unpack_from(data)
-    kind, version = data[104], data[25]
-    if version >= 4:
-        _, num_late, num_points = _LAS_EXTENDED.unpack_from(data)
+    # Offset of the points, number of records, point format, bytes per point, number of points
+    begin, num_records, kind, num_bytes, num_points = struct.unpack_from("<IIBHI", data, 96)
+    if data[25] >= 4:  # LAS 1.4: number of extended records, number of points
+        num_late, num_points = struct.unpack_from("<IQ", data, 243)
         num_records += num_late
     check_size(num_points * num_bytes, path)
     if num_records * _RECORD_BYTES > len(data):

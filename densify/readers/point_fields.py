@@ -90,7 +90,12 @@ class PointTimes:
 
     def _times_ns(self, values: NDArray[Any], stamp_ns: int | None) -> tuple[Int, Bool]:
         """Return (N,) times in ns and a mask of those within `reach_ns` of the sweep's middle."""
-        times_ns, is_valid = _in_ns(values, self.unit)
+        unit_ns = UNIT_NS[self.unit]
+        with np.errstate(invalid="ignore"):
+            is_valid: Bool = np.abs(values.astype(np.float64)) < _LATEST_NS / unit_ns
+        values = np.where(is_valid, values, 0)
+        whole = values.astype(np.int64)  # converted as integers, to keep every digit
+        times_ns = whole * unit_ns + np.rint((values - whole) * unit_ns).astype(np.int64)
         middle_ns = self.middle_ns + (stamp_ns or 0) * self.absolute
         if (self.other_clock or stamp_ns is None) and is_valid.any():
             middle_ns = round(_extent(times_ns[is_valid])[0])
@@ -106,16 +111,6 @@ class PointTimes:
         if self.other_clock and not self.reference:
             text += ", by another clock than the stamps: the first point is taken for the stamp's"
         return text + (f", the stamp is the {self.reference}" if self.reference else "")
-
-
-def _in_ns(values: NDArray[Any], unit: str) -> tuple[Int, Bool]:
-    """Return (N,) times in ns, and a mask of those that are finite numbers below `_LATEST_NS`."""
-    with np.errstate(invalid="ignore"):
-        is_valid: Bool = np.abs(values.astype(np.float64)) < _LATEST_NS / UNIT_NS[unit]
-    values = np.where(is_valid, values, 0)
-    whole = values.astype(np.int64)  # converted as integers, to keep every digit
-    fraction_ns = np.rint((values - whole) * UNIT_NS[unit]).astype(np.int64)
-    return whole * UNIT_NS[unit] + fraction_ns, is_valid
 
 
 def _extent(times: NDArray[Any]) -> tuple[float, float]:
