@@ -19,9 +19,13 @@ from densify.outputs.simulated_street import config_text
 from densify.readers import describe, open_sequence
 from densify.readers.folder import Folder
 from densify.readers.folder_config import FolderConfig
+from densify.readers.kitti import KittiRaw
 from densify.readers.street import Street
+from tests.command import exit_code
+from tests.dataset_scenes import copy_drive
 from tests.reader_checks import check_cameras, check_refused, check_sweeps, check_truth
 from tests.test_point_files import pcd
+from tests.test_reader_damage import LFS
 
 FORMAT = "folder"
 
@@ -92,6 +96,18 @@ def test_numbered_files_alone_open(tmp_path):
     assert re.search(r"^poses +none$", text, re.M)
     with pytest.raises(InputError, match="no poses; let the sweeps register themselves"):
         sequence.T_world_lidar(3)
+
+
+@pytest.mark.parametrize("column", ["x", "z", "t", "lidar", "intensity"])
+def test_a_value_that_is_not_finite_costs_its_point_alone(column, tmp_path):
+    """An intensity that is not finite becomes 0."""
+    columns = dict(zip("xyz", scan().T.copy(), strict=True))
+    columns |= {"lidar": np.zeros(600), "t": np.linspace(0, 0.0999, 600), "intensity": np.ones(600)}
+    columns[column][7:10] = [np.nan, np.inf, -np.inf]
+    np.savez(tmp_path / "0.npz", **columns)
+    sweep = Folder(config(tmp_path, "sweeps: {lidar: lidar}"))[0]
+    wrong = sweep.intensity == 0 if column == "intensity" else ~np.isin(np.arange(600), sweep.row)
+    np.testing.assert_array_equal(np.flatnonzero(wrong), [7, 8, 9])
 
 
 @pytest.mark.parametrize("form", ["{}.{:09d}", "{}_{:09d}", "cloud_{}{:09d}_lidar"])
@@ -214,6 +230,17 @@ def test_viewpoints_of_pcd_files_are_poses(tmp_path):
     assert "VIEWPOINT" in dict(sequence.findings())["poses from"]
 
 
+def test_poses_beside_each_sweep(tmp_path):
+    bare(tmp_path, ["0.bin", "1.bin", "2.bin"])
+    for words in ("1 0 0 {0} 0 1 0 0 0 0 1 2", "{0} 0 2 0 0 0 1"):
+        for i in range(3):
+            (tmp_path / f"{i}.pose").write_text(words.format(3.0 * i))
+        np.testing.assert_allclose(Folder(tmp_path).T_world_lidar(2)[:3, 3], [6, 0, 2])
+    (tmp_path / "1.pose").write_text("1 2 3\n0 0 90\n")
+    with pytest.raises(InputError, match=r"1\.pose: got 6 numbers, expected 12 or 16"):
+        Folder(tmp_path)
+
+
 # --- cameras, the example -------------------------------------------------------------------------
 
 
@@ -310,7 +337,13 @@ def edit_camera(old, new):
     return change
 
 
+def empty(folder):
+    for path in folder.glob("*.bin"):
+        path.write_bytes(b"")
+
+
 WRONG = [
+    (empty, "all 2 files of sweeps are empty"),
     *((edit("densify.yaml", text), says) for text, says in WRONG_CONFIGS),
     *((edit_camera(old, new), says) for old, new, says in CAMERA_EDITS),
     *((edit(name, text), says) for name, text, says in WRONG_FILES),
@@ -334,6 +367,54 @@ def test_damaged_sweeps_and_images_are_refused_in_a_line(tmp_path):
         table.tofile(path)
         with pytest.raises(InputError, match=rf"2\.bin.*{says}"):
             sequence[2]
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy", ".npz", ".csv", ".las", ".bag"])
+def test_pointers_of_git_lfs_are_called_that(suffix, tmp_path, capsys):
+    for i in range(2 - (suffix == ".bag")):
+        (tmp_path / f"{i:06d}{suffix}").write_text(LFS)
+    assert exit_code("info", tmp_path) == 2
+    assert "is a Git LFS pointer, not the data; run git lfs pull" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_recording_says_what_is_there(border_drive, tmp_path):
+    (tmp_path / "pictures").mkdir()
+    for i in range(3):
+        (tmp_path / "pictures" / f"{i}.JPG").write_bytes(b"x")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.odt").write_text("x")
+    drive = border_drive
+    places = {
+        tmp_path / "pictures": "it holds 3 .jpg files, no lidar sweeps;",
+        tmp_path / "empty": "it is empty;",
+        tmp_path / "notes.odt": "it is a .odt file;",
+        drive / "image_02": f"it holds 1 folder, .*inside a KITTI drive: give {drive};",
+        drive / "image_02" / "data": f"it holds .*inside a KITTI drive: give {drive};",
+    }
+    for place, says in places.items():
+        with pytest.raises(InputError, match=says) as error:
+            open_sequence(place)
+        assert len(str(error.value)) < 500
+        assert "densify info --help says what each reads" in str(error.value)
+
+
+def test_the_sweeps_of_a_drive_alone_say_what_is_lost(border_drive):
+    for place in (border_drive / "velodyne_points", border_drive / "velodyne_points" / "data"):
+        told = "\n".join(open_sequence(place).gaps())
+        assert f"is a part of the KITTI drive {border_drive}: read alone it has no times" in told
+
+
+def test_a_drive_that_is_a_link_has_the_calibration_beside_it(border_drive, tmp_path):
+    target = copy_drive(border_drive, tmp_path / "store" / "2011_09_26")
+    link = tmp_path / "mine" / target.name
+    link.parent.mkdir()
+    link.symlink_to(target)
+    assert KittiRaw(link).cameras["image_02"].width_px
+    for path in target.parent.glob("calib_*.txt"):
+        text = path.read_text().replace("P_rect_02: ", "P_rect_02: 1")  # 1x fx
+        (link.parent / path.name).write_text(text)
+    ours, theirs = (KittiRaw(place).cameras["image_02"].K[0, 0] for place in (link, target))
+    assert ours != theirs
 
 
 # --- real sweeps ----------------------------------------------------------------------------------
