@@ -39,8 +39,9 @@ class Maker:
         stamp = self.make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 10**9))
         return self.make("std_msgs/msg/Header", *(() if self.is_ros2 else (7,)), stamp, frame)
 
-    def put(self, topic: str, type_: str, message: Any, log_ns: int) -> None:
-        self.written.append(Record(log_ns, topic, type_, message))
+    def put(self, topic: str, type_: str, log_ns: int, *values: Any) -> None:
+        """values: of the message's fields, in order."""
+        self.written.append(Record(log_ns, topic, type_, self.make(type_, *values)))
 
     def cloud(
         self,
@@ -54,32 +55,29 @@ class Maker:
     ) -> None:
         """columns: by name, in order; 3 bytes stand between them."""
         kinds = [column.dtype.str[1:] for column in columns.values()]
-        sizes = [column.dtype.itemsize + 3 for column in columns.values()]
-        offsets = [sum(sizes[:i]) for i in range(len(sizes))]
+        ends = np.cumsum([column.dtype.itemsize + 3 for column in columns.values()]).tolist()
         layout: Any = {
             "names": [*columns],
             "formats": [(">" if big else "<") + kind for kind in kinds],
-            "offsets": offsets,
-            "itemsize": sum(sizes),
+            "offsets": [0, *ends[:-1]],
+            "itemsize": ends[-1],
         }
         points = np.zeros(len(columns["x"]), np.dtype(layout))
         for name, column in columns.items():
             points[name] = column
         fields = [
             self.make("sensor_msgs/msg/PointField", name, offset, KINDS[kind], 1)
-            for name, offset, kind in zip(columns, offsets, kinds, strict=True)
+            for name, offset, kind in zip(columns, layout["offsets"], kinds, strict=True)
         ]
         rows = points.view(np.uint8).reshape(height, -1)
         data = np.pad(rows, ((0, 0), (0, row_padding)), constant_values=9)
-        sizes_and_data = (sum(sizes), data.shape[1], data.reshape(-1))
-        shape = (height, len(points) // height)
-        values = (self.header(stamp_ns, frame), *shape, fields, big, *sizes_and_data, False)
-        type_ = "sensor_msgs/msg/PointCloud2"
-        self.put(topic, type_, self.make(type_, *values), stamp_ns + PERIOD_NS)
+        shape = (self.header(stamp_ns, frame), height, len(points) // height)
+        content = (fields, big, ends[-1], data.shape[1], data.reshape(-1), False)
+        self.put(topic, "sensor_msgs/msg/PointCloud2", stamp_ns + PERIOD_NS, *shape, *content)
 
-    def sweeps(self, num: int = 2, **options: Any) -> None:
+    def sweeps(self, num: int = 2, first_ns: int = STAMP_NS, **options: Any) -> None:
         for i in range(num):
-            self.cloud(scan(), STAMP_NS + i * PERIOD_NS, **options)
+            self.cloud(scan(), first_ns + i * PERIOD_NS, **options)
 
     def image(
         self,
@@ -98,8 +96,7 @@ class Maker:
         rows = np.pad(rows, ((0, 0), (0, step - rows.shape[1])))
         header = self.header(stamp_ns, frame)
         values = (header, height, width, encoding, 0, step, rows.reshape(-1))
-        type_ = "sensor_msgs/msg/Image"
-        self.put(topic, type_, self.make(type_, *values), stamp_ns + 1)
+        self.put(topic, "sensor_msgs/msg/Image", stamp_ns + 1, *values)
 
     def compressed(
         self,
@@ -109,9 +106,8 @@ class Maker:
         frame: str = "front_optical",
     ) -> None:
         """data: of a PNG file."""
-        type_, header = "sensor_msgs/msg/CompressedImage", self.header(stamp_ns, frame)
-        message = self.make(type_, header, "png", np.frombuffer(data, np.uint8))
-        self.put(topic, type_, message, stamp_ns + 1)
+        values = (self.header(stamp_ns, frame), "png", np.frombuffer(data, np.uint8))
+        self.put(topic, "sensor_msgs/msg/CompressedImage", stamp_ns + 1, *values)
 
     def info(self, topic: str = "/front/camera_info", size=(6, 8), **changes: Any) -> None:
         """changes: frame, model, d, k, r, p, binning, roi (x, y, height, width)."""
@@ -123,10 +119,8 @@ class Maker:
         arrays = [np.array(a, float) for a in (changes.get("d", []), K, R, P)]
         header = self.header(STAMP_NS + 1, changes.get("frame", "front_optical"))
         values = (header, *size, changes.get("model", "plumb_bob"), *arrays)
-        message = self.make(
-            "sensor_msgs/msg/CameraInfo", *values, *changes.get("binning", (0, 0)), roi
-        )
-        self.put(topic, "sensor_msgs/msg/CameraInfo", message, STAMP_NS + 2)
+        binning = changes.get("binning", (0, 0))
+        self.put(topic, "sensor_msgs/msg/CameraInfo", STAMP_NS + 2, *values, *binning, roi)
 
     def transform(
         self, parent: str, child: str, T: np.ndarray, topic: str = "/tf_static", stamp_ns=STAMP_NS
@@ -135,16 +129,13 @@ class Maker:
         content = self.make("geometry_msgs/msg/Transform", vector, self.turn(T))
         header = self.header(stamp_ns, parent)
         stamped = self.make("geometry_msgs/msg/TransformStamped", header, child, content)
-        message = self.make("tf2_msgs/msg/TFMessage", [stamped])
-        self.put(topic, "tf2_msgs/msg/TFMessage", message, stamp_ns)
+        self.put(topic, "tf2_msgs/msg/TFMessage", stamp_ns, [stamped])
 
     def turn(self, T: np.ndarray) -> Any:
         quaternion = map(float, Rotation.from_matrix(T[:3, :3]).as_quat())
         return self.make("geometry_msgs/msg/Quaternion", *quaternion)
 
-    def odometry(
-        self, T: np.ndarray, stamp_ns: int, child: str = "base", topic: str = "/odom"
-    ) -> None:
+    def odometry(self, T: np.ndarray, stamp_ns: int, child: str = "base") -> None:
         place = self.make("geometry_msgs/msg/Point", *map(float, T[:3, 3]))
         pose = self.make("geometry_msgs/msg/Pose", place, self.turn(T))
         zero = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
@@ -153,8 +144,8 @@ class Maker:
             self.make(f"geometry_msgs/msg/{name}WithCovariance", value, np.zeros(36))
             for name, value in (("Pose", pose), ("Twist", twist))
         ]
-        message = self.make("nav_msgs/msg/Odometry", self.header(stamp_ns, "odom"), child, *cover)
-        self.put(topic, "nav_msgs/msg/Odometry", message, stamp_ns)
+        header = self.header(stamp_ns, "odom")
+        self.put("/odom", "nav_msgs/msg/Odometry", stamp_ns, header, child, *cover)
 
     def write(self, folder: Path, compressed: bool = False) -> Path:
         """The bag: a ROS 2 bag's folder, or a .bag file. compressed: its files as a whole."""
@@ -162,8 +153,7 @@ class Maker:
         if self.is_ros2:
             from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-            mcap = self.suffix == ".mcap"
-            plugin = StoragePlugin.MCAP if mcap else StoragePlugin.SQLITE3
+            plugin = StoragePlugin.MCAP if self.suffix == ".mcap" else StoragePlugin.SQLITE3
             place = folder / "drive"
             writer: Any = Writer(place, version=9, storage_plugin=plugin)
             if compressed:
@@ -175,12 +165,11 @@ class Maker:
             place = folder / "drive.bag"
             writer, serialize = Writer1(place), self.types.serialize_ros1
         with writer as bag:
-            records = [Record(*record) for record in self.written]
             added = {
                 topic: bag.add_connection(topic, type_, typestore=self.types)
-                for topic, type_ in sorted({(r.topic, r.type) for r in records})
+                for topic, type_ in sorted({(r.topic, r.type) for r in self.written})
             }
-            for record in sorted(records, key=lambda record: record.log_ns):
+            for record in sorted(self.written, key=lambda record: record.log_ns):
                 data = serialize(record.message, record.type)
                 bag.write(added[record.topic], record.log_ns, data)
         return place

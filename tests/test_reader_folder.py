@@ -19,9 +19,13 @@ from densify.outputs.simulated_street import config_text
 from densify.readers import describe, open_sequence
 from densify.readers.folder import Folder
 from densify.readers.folder_config import FolderConfig
+from densify.readers.kitti import KittiRaw
 from densify.readers.street import Street
+from tests.command import exit_code
+from tests.dataset_scenes import copy_drive
 from tests.reader_checks import check_cameras, check_refused, check_sweeps, check_truth
-from tests.test_point_files import write_pcd
+from tests.test_point_files import pcd
+from tests.test_reader_damage import LFS
 
 FORMAT = "folder"
 
@@ -94,6 +98,18 @@ def test_numbered_files_alone_open(tmp_path):
         sequence.T_world_lidar(3)
 
 
+@pytest.mark.parametrize("column", ["x", "z", "t", "lidar", "intensity"])
+def test_a_value_that_is_not_finite_costs_its_point_alone(column, tmp_path):
+    """An intensity that is not finite becomes 0."""
+    columns = dict(zip("xyz", scan().T.copy(), strict=True))
+    columns |= {"lidar": np.zeros(600), "t": np.linspace(0, 0.0999, 600), "intensity": np.ones(600)}
+    columns[column][7:10] = [np.nan, np.inf, -np.inf]
+    np.savez(tmp_path / "0.npz", **columns)
+    sweep = Folder(config(tmp_path, "sweeps: {lidar: lidar}"))[0]
+    wrong = sweep.intensity == 0 if column == "intensity" else ~np.isin(np.arange(600), sweep.row)
+    np.testing.assert_array_equal(np.flatnonzero(wrong), [7, 8, 9])
+
+
 @pytest.mark.parametrize("form", ["{}.{:09d}", "{}_{:09d}", "cloud_{}{:09d}_lidar"])
 def test_names_that_are_times(form, tmp_path):
     stamps = [99_997_611, 203_504_999]
@@ -110,29 +126,13 @@ def test_names_that_are_times(form, tmp_path):
         ("2011-09-26 13:10:51.1\n2011-09-26 13:10:51.261\n2011-09-26T13:10:51.4\n", 139_000_000),
         ("timestamp,filename\n0.3,c_3.bin\n0.1,a_1.bin\n0.2,b_2.bin\n", 100_000_000),
         ("a_1.bin 5.0\nb_2.bin 5.1\nc_3.bin 5.2\n", 100_000_000),
+        ("\ufeff0.0\r\n0.1\r\n0.2\r\n", 100_000_000),
     ],
 )
 def test_stamps_in_a_file(text, step_ns, tmp_path):
     (tmp_path / "timestamps.txt").write_text(text)
     sequence = Folder(bare(tmp_path, ["a_1.bin", "b_2.bin", "c_3.bin"]))
     assert sequence.stamp_ns(3) - sequence.stamp_ns(2) == step_ns
-
-
-def test_byte_order_marks_are_skipped(tmp_path):
-    """In every text file of the folder, with the line ends of Windows too."""
-    plain = Folder(config(bare(tmp_path / "a", ["0.bin", "1.bin"]), "sweeps: {scale_m: 2}\n"))
-    marked = bare(tmp_path / "b", ["0.bin", "1.bin"])
-    texts = {
-        "densify.yaml": "sweeps: {scale_m: 2}\n",
-        "timestamps.txt": "0.0\n0.1\n",
-        "poses.txt": "0.0 1 2 3 0 0 0 1\n0.1 1 2 4 0 0 0 1\n",
-    }
-    for name, text in texts.items():
-        (marked / name).write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    sequence = Folder(marked)
-    np.testing.assert_array_equal(sequence[0].points, plain[0].points)
-    assert sequence.stamp_ns(1) - sequence.stamp_ns(0) == 100_000_000
-    np.testing.assert_array_equal(sequence.T_world_lidar(1)[:3, 3], [1, 2, 4])
 
 
 # --- poses ----------------------------------------------------------------------------------------
@@ -187,8 +187,8 @@ def test_compensation_is_undone_with_stamped_poses(tmp_path):
     stored = fired + time_s[:, None] * [10.0, 0, 0]
     bare(tmp_path, ["0.bin", "1.bin"], np.column_stack([stored, np.zeros(600), time_s]))
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n0.2 2 0 0 0 0 0 1\n")
-    text = "sweeps: {columns: [x, y, z, intensity, time], compensated: true}\n"
-    sweep = Folder(config(tmp_path, text))[0]
+    config(tmp_path, "sweeps: {columns: [x, y, z, intensity, time], compensated: true}\n")
+    sweep = Folder(tmp_path)[0]
     np.testing.assert_allclose(sweep.points, fired, atol=1e-5)
     assert sweep.offset_ns[-1] == pytest.approx(99_900_000, abs=10)
     (tmp_path / "poses.txt").unlink()
@@ -204,10 +204,8 @@ def test_sweeps_in_the_frame_of_their_poses_are_taken_back(timed, tmp_path):
     turn = Rotation.from_euler("z", 40, degrees=True)
     placed = turn.apply(fired) + (5 + time_s[:, None] * 10) * [1.0, 0, 0]
     q = " ".join(map(str, turn.as_quat()))
-    names = "x, y, z, intensity, time" if timed else "x, y, z, intensity"
-    columns = [placed, np.zeros(600), time_s] if timed else [placed, np.zeros(600)]
-    bare(tmp_path, ["0.bin", "1.bin"], np.column_stack(columns))
-    config(tmp_path, f"sweeps: {{columns: [{names}], frame: poses}}\n")
+    bare(tmp_path, ["0.bin", "1.bin"], np.column_stack([placed, time_s]))
+    config(tmp_path, "sweeps: {columns: [x, y, z, time], frame: poses}\n")
     with pytest.raises(InputError, match="there are no poses"):
         Folder(tmp_path)
     (tmp_path / "poses.txt").write_text(f"0 5 0 0 {q}\n0.1 6 0 0 {q}\n0.2 7 0 0 {q}\n")
@@ -216,24 +214,31 @@ def test_sweeps_in_the_frame_of_their_poses_are_taken_back(timed, tmp_path):
 
 def test_viewpoints_of_pcd_files_are_poses(tmp_path):
     def write(name, viewpoint):
-        write_pcd(tmp_path / name, "binary")
-        data = (tmp_path / name).read_bytes()
-        lines = re.sub(rb"VIEWPOINT [^\n]*", f"VIEWPOINT {viewpoint}".encode(), data, count=1)
+        lines = re.sub(rb"VIEWPOINT [^\n]*", f"VIEWPOINT {viewpoint}".encode(), pcd("binary"))
         (tmp_path / name).write_bytes(lines)
 
     default = "0 0 0 1 0 0 0"
     write("0.pcd", default)
-    write("1.pcd", default)
-    with pytest.raises(InputError, match="no poses"):
-        Folder(tmp_path).T_world_lidar(1)
-    write("1.pcd", "1 2 3 0 0 0 0")  # some programs write no rotation
-    with pytest.raises(InputError, match="no poses"):
-        Folder(tmp_path).T_world_lidar(1)
+    for unknown in (default, "1 2 3 0 0 0 0"):  # some programs write no rotation
+        write("1.pcd", unknown)
+        with pytest.raises(InputError, match="no poses"):
+            Folder(tmp_path).T_world_lidar(1)
     write("1.pcd", f"{PLACE} {QW} {QX} {QY} {QZ}")
     sequence = Folder(tmp_path)
     np.testing.assert_allclose(sequence.T_world_lidar(0), np.eye(4), atol=1e-12)
     np.testing.assert_allclose(sequence.T_world_lidar(1), POSE, atol=1e-12)
     assert "VIEWPOINT" in dict(sequence.findings())["poses from"]
+
+
+def test_poses_beside_each_sweep(tmp_path):
+    bare(tmp_path, ["0.bin", "1.bin", "2.bin"])
+    for words in ("1 0 0 {0} 0 1 0 0 0 0 1 2", "{0} 0 2 0 0 0 1"):
+        for i in range(3):
+            (tmp_path / f"{i}.pose").write_text(words.format(3.0 * i))
+        np.testing.assert_allclose(Folder(tmp_path).T_world_lidar(2)[:3, 3], [6, 0, 2])
+    (tmp_path / "1.pose").write_text("1 2 3\n0 0 90\n")
+    with pytest.raises(InputError, match=r"1\.pose: got 6 numbers, expected 12 or 16"):
+        Folder(tmp_path)
 
 
 # --- cameras, the example -------------------------------------------------------------------------
@@ -249,12 +254,11 @@ def cameras(folder: Path) -> Path:
     (folder / "b" / "times.csv").write_text("0.15,x9.jpg\n0.3,other.jpg\n")
     T = "[[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]"
     shared = f"size: [8, 6], K: [9, 9, 3.5, 2.5], T_cam_lidar: {T}"
-    fisheye = "stamps: sweeps, model: fisheye, distortion: [0, 0, 0, 0]"
     text = f"""sweeps: {{files: lidar, rate_hz: 20}}
 cameras:
   front: {{files: a, {shared}, clock_offset_s: 0.001}}
   side: {{files: b, {shared}}}
-  rear: {{files: c, {shared}, {fisheye}}}
+  rear: {{files: c, {shared}, stamps: sweeps, model: fisheye, distortion: [0, 0, 0, 0]}}
 """
     return config(folder, text)
 
@@ -267,6 +271,11 @@ def test_images_by_names_file_and_sweeps(tmp_path):
     assert sequence.image("side", 9).shape == (6, 8, 3)
     assert sequence.cameras["front"].is_rectified and sequence.cameras["rear"].model == "fisheye"
     np.testing.assert_array_equal(sequence.cameras["front"].K[:2], [[9, 0, 3.5], [0, 9, 2.5]])
+    (told,) = sequence.gaps()
+    assert told.startswith("front: 2 images without stamps beside 2 sweeps: each is taken as")
+    assert told.removeprefix("front: ") in describe(sequence) and "rates" not in told
+    bare(tmp_path / "lidar", ["3.bin"])
+    assert "if their rates differ, give the images' times" in Folder(tmp_path).gaps()[0]
 
 
 def test_the_documented_example_is_right(tmp_path):
@@ -297,6 +306,7 @@ CAMERA_EDITS = [
     ("[[0, -1, 0, 0]", "[[0.5, -1, 0, 0]", r"front\.T_cam_lidar: .*three or four rows"),
     ("fisheye, distortion: [0, 0, 0, 0]", "pinhole, distortion: [1, 2]", "0, 4, 5, 8, 12, 14 co"),
     ("files: a,", "files: nowhere,", "no images, though densify"),
+    ("size: [8, 6]", "size: [9, 6]", "got an image of 8 x 6 px; expected 9 x 6, as the calib"),
 ]
 WRONG_FILES = [
     ("timestamps.txt", "1317042661.1\n", "got 1 times for 2 files"),
@@ -327,7 +337,13 @@ def edit_camera(old, new):
     return change
 
 
+def empty(folder):
+    for path in folder.glob("*.bin"):
+        path.write_bytes(b"")
+
+
 WRONG = [
+    (empty, "all 2 files of sweeps are empty"),
     *((edit("densify.yaml", text), says) for text, says in WRONG_CONFIGS),
     *((edit_camera(old, new), says) for old, new, says in CAMERA_EDITS),
     *((edit(name, text), says) for name, text, says in WRONG_FILES),
@@ -351,6 +367,54 @@ def test_damaged_sweeps_and_images_are_refused_in_a_line(tmp_path):
         table.tofile(path)
         with pytest.raises(InputError, match=rf"2\.bin.*{says}"):
             sequence[2]
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy", ".npz", ".csv", ".las", ".bag"])
+def test_pointers_of_git_lfs_are_called_that(suffix, tmp_path, capsys):
+    for i in range(2 - (suffix == ".bag")):
+        (tmp_path / f"{i:06d}{suffix}").write_text(LFS)
+    assert exit_code("info", tmp_path) == 2
+    assert "is a Git LFS pointer, not the data; run git lfs pull" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_no_recording_says_what_is_there(border_drive, tmp_path):
+    (tmp_path / "pictures").mkdir()
+    for i in range(3):
+        (tmp_path / "pictures" / f"{i}.JPG").write_bytes(b"x")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.odt").write_text("x")
+    drive = border_drive
+    places = {
+        tmp_path / "pictures": "it holds 3 .jpg files, no lidar sweeps;",
+        tmp_path / "empty": "it is empty;",
+        tmp_path / "notes.odt": "it is a .odt file;",
+        drive / "image_02": f"it holds 1 folder, .*inside a KITTI drive: give {drive};",
+        drive / "image_02" / "data": f"it holds .*inside a KITTI drive: give {drive};",
+    }
+    for place, says in places.items():
+        with pytest.raises(InputError, match=says) as error:
+            open_sequence(place)
+        assert len(str(error.value)) < 500
+        assert "densify info --help says what each reads" in str(error.value)
+
+
+def test_the_sweeps_of_a_drive_alone_say_what_is_lost(border_drive):
+    for place in (border_drive / "velodyne_points", border_drive / "velodyne_points" / "data"):
+        told = "\n".join(open_sequence(place).gaps())
+        assert f"is a part of the KITTI drive {border_drive}: read alone it has no times" in told
+
+
+def test_a_drive_that_is_a_link_has_the_calibration_beside_it(border_drive, tmp_path):
+    target = copy_drive(border_drive, tmp_path / "store" / "2011_09_26")
+    link = tmp_path / "mine" / target.name
+    link.parent.mkdir()
+    link.symlink_to(target)
+    assert KittiRaw(link).cameras["image_02"].width_px
+    for path in target.parent.glob("calib_*.txt"):
+        text = path.read_text().replace("P_rect_02: ", "P_rect_02: 1")  # 1x fx
+        (link.parent / path.name).write_text(text)
+    ours, theirs = (KittiRaw(place).cameras["image_02"].K[0, 0] for place in (link, target))
+    assert ours != theirs
 
 
 # --- real sweeps ----------------------------------------------------------------------------------

@@ -33,27 +33,23 @@ def vlp16_payload(azimuth_cdeg: int, since_us: int) -> bytes:
     return blocks + struct.pack("<IBB", since_us, 0x37, 0x22)  # strongest return, VLP-16
 
 
-def capture(num_turns: float, order: str = "<", magic: int = 0xA1B2C3D4) -> bytes:
-    """From straight ahead on; with a packet of another kind after each fifth."""
-    data = struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 65_535, 1)
+def records(num_turns: float, order: str = "<", magic: int = 0xA1B2C3D4) -> list[bytes]:
+    """The header of a capture, then its packets: from straight ahead on, with a packet of another
+    kind after each fifth."""
+    data = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 65_535, 1)]
     unit_ns = 1000 if magic == 0xA1B2C3D4 else 1
     for i in range(int(num_turns * PACKETS_PER_TURN)):
         since_us = i * PACKET_US
         payload = vlp16_payload(round(i * 36_000 / PACKETS_PER_TURN) % 36_000, since_us)
         for packet in (payload, bytes(512))[: 2 if i % 5 == 0 else 1]:
             size, fraction = len(HEADERS + packet), since_us * 1000 // unit_ns
-            data += struct.pack(f"{order}IIII", START_S, fraction, size, size) + HEADERS + packet
+            head = struct.pack(f"{order}IIII", START_S, fraction, size, size)
+            data.append(head + HEADERS + packet)
     return data
 
 
-def packets_of(data: bytes) -> list[bytes]:
-    """The records of a little-endian capture, its file header first."""
-    records, at = [data[:24]], 24
-    while at < len(data):
-        end = at + 16 + struct.unpack_from("<I", data, at + 8)[0]
-        records.append(data[at:end])
-        at = end
-    return records
+def capture(*options) -> bytes:
+    return b"".join(records(*options))
 
 
 @pytest.fixture
@@ -94,28 +90,22 @@ def test_turns_begin_straight_behind(tmp_path, order, magic):
 
 def test_lost_and_doubled_packets_are_told_and_doubled_ones_read_once(tmp_path):
     pytest.importorskip("velodyne_decoder")
-    whole, path = packets_of(capture(2.75)), tmp_path / "drive.pcap"
+    whole, path = records(2.75), tmp_path / "drive.pcap"
     path.write_bytes(b"".join(whole))
     complete = open_sequence(f"velodyne:{path}#VLP-16")
     num_complete = len(complete[0])
-    sizes = {len(packet) for packet in whole[1:]}
-    returns = [i for i, p in enumerate(whole) if i and len(p) == max(sizes)]
-    middle = returns[60:100]  # of the first whole turn
-    faulty = [p for i, p in enumerate(whole) if i not in middle[:3]]
-    again = faulty.index(whole[middle[20]])
-    path.write_bytes(b"".join([*faulty[: again + 1], *faulty[again:]]))
+    returns = [i for i, packet in enumerate(whole) if len(packet) == max(map(len, whole))]
+    lost, twice = returns[60:63], returns[80]  # of the first whole turn
+    kept = [i for i in range(len(whole)) if i not in lost]
+    path.write_bytes(b"".join(whole[i] for i in sorted([*kept, twice])))
     sequence = open_sequence(f"velodyne:{path}#VLP-16")
     (_, told), num = sequence.findings()[0], len(returns) - 3
     assert told.startswith(f"{num}, 3 lost (1.4 %)") and "1 captured twice" in told
     assert len(sequence[0]) == num_complete - 3 * 12 * 32
     assert "0 lost (0.0 %), 0 captured" in complete.findings()[0][1]
-
-
-def test_what_is_cut_off_is_left_out(vlp16):
-    pytest.importorskip("velodyne_decoder")
-    whole = vlp16.read_bytes()
-    vlp16.write_bytes(whole[: len(whole) // 2])  # in the middle of a packet
-    assert list(Velodyne(vlp16, "VLP-16").frames) == [0]
+    cut_off = b"".join(whole)
+    path.write_bytes(cut_off[: len(cut_off) // 2])  # in the middle of a packet
+    assert list(Velodyne(path, "VLP-16").frames) == [0]
 
 
 def test_the_model_or_the_metadata_has_to_be_named(vlp16):
@@ -128,21 +118,17 @@ def test_the_model_or_the_metadata_has_to_be_named(vlp16):
         open_sequence(f"ouster:{vlp16}#third.json")
 
 
-PLAIN_PACKET = struct.pack("<IIII", 0, 0, 600, 600) + bytes(600)
+NO_CAPTURES = {
+    "not a capture of packets": b"",
+    "editcap": b"\x0a\x0d\x0d\x0a" + bytes(60),
+    "no Velodyne packets": capture(0) + struct.pack("<IIII", 0, 0, 600, 600) + bytes(600),
+}
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        (b"", "not a capture of packets"),
-        (b"\x0a\x0d\x0d\x0a" + bytes(60), "editcap"),
-        (capture(0), "no Velodyne packets"),
-        (capture(0) + PLAIN_PACKET, "no Velodyne packets"),
-    ],
-)
-def test_what_is_no_capture_is_refused_in_a_line(tmp_path, content, says):
+@pytest.mark.parametrize("says", NO_CAPTURES)
+def test_what_is_no_capture_is_refused_in_a_line(tmp_path, says):
     pytest.importorskip("velodyne_decoder")
-    (tmp_path / "drive.pcap").write_bytes(content)
+    (tmp_path / "drive.pcap").write_bytes(NO_CAPTURES[says])
     check_refused(f"velodyne:{tmp_path / 'drive.pcap'}#VLP-16", says, tmp_path)
 
 

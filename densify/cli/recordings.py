@@ -235,7 +235,7 @@ def answer_flow(options: argparse.Namespace) -> Iterator[Answer]:
 
 def read_points(path: Path) -> Float:
     """Return the (N,3) float64 points of a file in metres, in the order of the file."""
-    columns = read_table(path).columns
+    columns = read_table(path)
     if missing := [name for name in "xyz" if name not in columns]:
         raise InputError(
             f"{path}: no column {missing[0]}: got {', '.join(columns)}, expected x, y and z"

@@ -34,7 +34,7 @@ def numbered_files(
             Two files of one suffix with the same number raise InputError.
         stem: Pattern of a whole name without suffix; its first group is the number.
     """
-    entries = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
+    entries = [folder] if folder.is_file() else folder.glob("*")
     files = [
         (suffixes.index(suffix), int(match[1]), path)
         for path in entries
@@ -174,10 +174,11 @@ def pose(T: Any, where: str) -> Float:
     rotation is mirrored or not orthonormal to 0.001.
     """
     T = np.asarray(T, np.float64)
-    T = T.reshape(-1, 4) if T.size in (12, 16) else T
-    if T.shape not in ((4, 4), (3, 4)) or not np.isfinite(T).all():
-        got = "NaN or infinity" if T.shape in ((4, 4), (3, 4)) else f"shape {T.shape}"
+    is_pose = T.size in (12, 16)
+    if not is_pose or not np.isfinite(T).all():
+        got = "NaN or infinity" if is_pose else f"shape {T.shape}"
         raise InputError(f"{where}: got {got}, expected a (4,4) pose of finite numbers")
+    T = T.reshape(-1, 4)
     R = T[:3, :3]
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > _ORTHONORMAL_TOLERANCE or np.linalg.det(R) < 0:
@@ -217,21 +218,18 @@ def quaternion_pose(
             f"{where}: got a quaternion of length {length:.4g} and the translation "
             f"{numbers[4:].tolist()}, expected a unit quaternion w x y z and metres x y z"
         )
-    quaternion, translation = numbers[:4], numbers[4:]
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()
-    T[:3, 3] = translation
+    T[:3, :3] = Rotation.from_quat(numbers[[1, 2, 3, 0]]).as_matrix()
+    T[:3, 3] = numbers[4:]
     return T
 
 
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
     """Return (K,4,4) poses at centres (K,3) m, turned about z by headings (K,) rad from x to y."""
     T = np.tile(np.eye(4), (len(centre_m), 1, 1))
-    cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
-    T[:, 0, 0] = cosine
-    T[:, 0, 1] = -sine
-    T[:, 1, 0] = sine
-    T[:, 1, 1] = cosine
+    T[:, 0, 0] = T[:, 1, 1] = np.cos(heading_rad)
+    T[:, 1, 0] = np.sin(heading_rad)
+    T[:, 0, 1] = -T[:, 1, 0]
     T[:, :3, 3] = centre_m
     return T
 

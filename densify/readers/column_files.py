@@ -2,7 +2,7 @@
 """Read columns of feather, parquet and pickled files of data frames as arrays, and check them.
 
 No code of a pickle is run: imported names become classes that only store their arguments, from
-which the columns are taken. Names that a data frame does not need are refused.
+which the columns are taken. Names of other packages than pandas and NumPy are refused.
 """
 
 from __future__ import annotations
@@ -107,6 +107,9 @@ def _arrow_array(column: Any, kind: str, where: str) -> NDArray[Any]:
 
 # Pickles
 
+_PACKAGES = ("pandas", "numpy")  # whose names a pickled data frame needs, besides slice
+_NUMBERS = re.compile(r"[fiu][1248]|b1")
+
 
 class _Record:
     """Store the constructor arguments and the state of a pickled object, without making it."""
@@ -123,34 +126,14 @@ class _Record:
         self.state = state
 
 
-_FRAME, _SLICE = "pandas.core.frame.DataFrame", "builtins.slice"
-_RECORDS: dict[str, type[_Record]] = {
-    name: type(name.rpartition(".")[2], (_Record,), {})
-    for name in (
-        _FRAME,
-        "pandas.core.internals.managers.BlockManager",
-        "pandas.core.indexes.base._new_Index",
-        "pandas.core.indexes.base.Index",
-        "pandas.core.indexes.numeric.Int64Index",
-        "pandas.core.indexes.range.RangeIndex",
-        "numpy.core.multiarray._reconstruct",
-        "numpy._core.multiarray._reconstruct",
-        "numpy.ndarray",
-        "numpy.dtype",
-        _SLICE,
-    )
-}
-_NUMBERS = re.compile(r"[fiu][1248]|b1")
-
-
 class _Unpickler(pickle._Unpickler):
     """Unpickle in pure Python, where a damaged file cannot read outside its buffers."""
 
     def find_class(self, module: str, name: str) -> type[_Record]:
-        full_name = f"{module}.{name}"
-        if full_name not in _RECORDS:
-            raise pickle.UnpicklingError(f"it names {full_name}")
-        return _RECORDS[full_name]
+        is_slice = (module, name) == ("builtins", "slice")
+        if module.partition(".")[0] not in _PACKAGES and not is_slice:
+            raise pickle.UnpicklingError(f"it names {module}.{name}")
+        return type(name, (_Record,), {})
 
 
 def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
@@ -171,19 +154,18 @@ def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
 
 def _pickled_columns(frame: Any) -> dict[str, NDArray[Any]]:
     """Return the columns of a frame; pandas stores the C columns of a type together, (C,N)."""
-    if not isinstance(frame, _RECORDS[_FRAME]):
+    if type(frame).__name__ != "DataFrame":
         raise ValueError(f"it holds a {type(frame).__name__}")
     manager_state = frame.state["_data"].state[-1]["0.14.1"]
     names = manager_state["axes"][0].args[1]["data"].state[-1]
-    columns = {}
+    columns: dict[str, NDArray[Any]] = {}
     for block in manager_state["blocks"]:
         values = _pickled_array(block["values"])
         # Numbers of the block's columns in the frame, as a slice or an array
         placement = block["mgr_locs"]
-        is_slice = isinstance(placement, _RECORDS[_SLICE])
+        is_slice = type(placement).__name__ == "slice"
         numbers = range(*placement.args) if is_slice else _pickled_array(placement).tolist()
-        for row, number in enumerate(numbers):
-            columns[str(names[number])] = values[row]
+        columns |= {str(names[number]): row for number, row in zip(numbers, values, strict=True)}
     return columns
 
 

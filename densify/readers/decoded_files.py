@@ -33,15 +33,10 @@ _folders_warned_of: set[Path] = set()
 _STRAY, _CUT_OFF, _NO_END = "extraneous bytes", "premature end of data", "Premature end of JPEG"
 _RESTART_OR_END = re.compile(rb"\xff[\xd0-\xd7\xd9]")
 _SCAN, _END = b"\xff\xda", b"\xff\xd9"
-_MARKER_BYTES = 2
 _MOST_STRAY_BYTES = 16  # wrongly decoded data often leave more, up to all of a restart interval
 _MOST_MARKERS = 512  # each takes some milliseconds
 
-# Offset of the points, number of records, bytes per point, number of points.
-_LAS_HEADER = struct.Struct("<96xIIxHI")
-# LAS 1.4 only: offset and number of extended records, number of points.
-_LAS_EXTENDED = struct.Struct("<235xQIQ")
-_RECORD_BYTES = 54  # smallest size of a variable length record
+_RECORD_BYTES = 54  # smallest size of a variable length record of a LAS file
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -60,14 +55,9 @@ def read_arrays(
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {
-                member.filename.removesuffix(".npy"): member
-                for member in archive.infolist()
-                if member.filename.endswith(".npy")
-            }
-            wanted = {
-                name: member for name, member in members.items() if names is None or name in names
-            }
+            stored = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+            members = {member.filename.removesuffix(".npy"): member for member in stored}
+            wanted = {name: members[name] for name in members if names is None or name in names}
             check_size(sum(member.file_size for member in wanted.values()), path, most_bytes)
             return {name: _array(archive.read(member)) for name, member in wanted.items()}
     except InputError:
@@ -78,8 +68,7 @@ def read_arrays(
 
 def _array(data: bytes) -> NDArray[Any]:
     """Return the array of .npy data; raise ValueError if the header claims more than follows."""
-    file = io.BytesIO(data)
-    header = np.lib.format
+    file, header = io.BytesIO(data), np.lib.format
     version = header.read_magic(file)
     read = header.read_array_header_1_0 if version == (1, 0) else header.read_array_header_2_0
     shape, _, dtype = read(file)
@@ -117,13 +106,8 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
             folder = Path(where).parent
             if mended and folder not in _folders_warned_of:
                 _folders_warned_of.add(folder)
-                _log.warning(
-                    "%s: %s; all of its pixels are there and are read. Others like it in %s are "
-                    "not named",
-                    where,
-                    mended,
-                    folder,
-                )
+                message = "%s: %s; all of its pixels are there and are read. Others like it in %s "
+                _log.warning(message + "are not named", where, mended, folder)
             return pixels
         flags = cv2.IMREAD_UNCHANGED if as_stored else cv2.IMREAD_COLOR
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -201,7 +185,7 @@ def _without_stray_bytes(data: bytes) -> tuple[bytes, int]:
     # Marker by marker; ``end`` is the end of the marker before.
     for _ in range(_MOST_MARKERS):
         marker = _RESTART_OR_END.search(data, end)
-        if marker is None or data[end - _MARKER_BYTES : end] == _END:
+        if marker is None or data[end - 2 : end] == _END:
             return data, num_mended
         begin = marker.start()
         tail = data[begin:]
@@ -209,8 +193,7 @@ def _without_stray_bytes(data: bytes) -> tuple[bytes, int]:
         # belongs to the image, those before it were stray.
         num_stray = 0
         while num_stray <= _MOST_STRAY_BYTES:
-            _, complaint = _decoded_strictly(data[: begin - num_stray - 1] + tail)
-            if _CUT_OFF in complaint:
+            if _CUT_OFF in _decoded_strictly(data[: begin - num_stray - 1] + tail)[1]:
                 break
             num_stray += 1
         if num_stray:
@@ -218,7 +201,7 @@ def _without_stray_bytes(data: bytes) -> tuple[bytes, int]:
             if num_stray > _MOST_STRAY_BYTES or not _ends_in_ones(data, begin - num_stray):
                 raise ValueError(f"{num_stray} bytes before the marker at {begin} are not decoded")
             num_mended += 1
-        end = begin - num_stray + _MARKER_BYTES
+        end = begin - num_stray + 2  # bytes of a marker
     raise ValueError(f"more than {_MOST_MARKERS} restart markers")
 
 
@@ -260,10 +243,10 @@ def read_las(path: Path) -> Any:
 
 def _check_las(data: bytes, path: Path) -> None:
     """Raise an exception if the points, records and chunks stated in a LAS header do not fit."""
-    begin, num_records, num_bytes, num_points = _LAS_HEADER.unpack_from(data)
-    kind, version = data[104], data[25]
-    if version >= 4:
-        _, num_late, num_points = _LAS_EXTENDED.unpack_from(data)
+    # Offset of the points, number of records, point format, bytes per point, number of points
+    begin, num_records, kind, num_bytes, num_points = struct.unpack_from("<IIBHI", data, 96)
+    if data[25] >= 4:  # LAS 1.4: number of extended records, number of points
+        num_late, num_points = struct.unpack_from("<IQ", data, 243)
         num_records += num_late
     check_size(num_points * num_bytes, path)
     if num_records * _RECORD_BYTES > len(data):

@@ -61,7 +61,7 @@ class FileSequence(ABC):
         self.frames: Sequence[int] = frames
         self.cameras: Mapping[str, Camera] = cameras or {}
         self.truth = truth
-        self._frames = frozenset(frames)
+        self._frames = dict.fromkeys(frames)
         self._exposed_ns = dict(exposed_ns or {})
         self._files = files or {}
         self._image_files = images or {}
@@ -129,13 +129,13 @@ class FileSequence(ABC):
                 f"{path}: holds no points (frame {frame}: {len(returns.points)} rows, none valid"
                 f"{untimed * bool(returns.num_untimed)}); choose a key or window without this frame"
             )
-        intensity, lidar = _rows(returns.intensity, row), _rows(returns.lidar, row)
-        if intensity is not None:
-            intensity = np.where(np.isfinite(intensity), intensity, 0)
+        zeros = np.zeros(len(returns.points), np.uint8)
+        intensity = (zeros if returns.intensity is None else returns.intensity)[row]
+        lidar = (zeros if returns.lidar is None else returns.lidar)[row]
         # Numbers of scanners are stored in 8 bits.
         origins = returns.scanner_origins
         num_scanners = 256 if origins is None else len(origins)
-        if lidar is not None and not 0 <= lidar.min() <= lidar.max() < num_scanners:
+        if not 0 <= lidar.min() <= lidar.max() < num_scanners:
             raise InputError(
                 f"{path}: got points of scanner {lidar.min()} to {lidar.max()}, expected 0 to "
                 f"{num_scanners - 1}"
@@ -144,11 +144,11 @@ class FileSequence(ABC):
             frame=int(frame),
             stamp_ns=self.stamp_ns(frame),
             points=np.asarray(returns.points.take(row, axis=0), np.float64),
-            intensity=np.asarray(np.zeros(len(row)) if intensity is None else intensity, "f4"),
-            offset_ns=_rows(returns.offset_ns, row),
-            lidar=np.asarray(np.zeros(len(row)) if lidar is None else lidar, np.uint8),
+            intensity=np.where(np.isfinite(intensity), intensity, 0).astype(np.float32),
+            offset_ns=None if returns.offset_ns is None else returns.offset_ns[row],
+            lidar=lidar.astype(np.uint8),
             row=row.astype(np.int64, copy=False),
-            scanner_origins=returns.scanner_origins,
+            scanner_origins=origins,
             R_scanner_lidar=returns.R_scanner_lidar,
             num_untimed=returns.num_untimed,
         )
@@ -173,16 +173,10 @@ class FileSequence(ABC):
 
     def check_frame(self, frame: int) -> None:
         """Raise InputError, with the existing frame numbers, if the sweep does not exist."""
-        if frame not in self._frames:
-            checks.find_entry(dict.fromkeys(self.frames), frame, "sweep", self.where)
+        checks.find_entry(self._frames, frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
         """Return the camera of an image; raise InputError if the image does not exist."""
         calibrated = checks.camera_named(self.cameras, camera, self.where)
         checks.find_entry(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated
-
-
-def _rows(column: NDArray[Any] | None, row: Int) -> NDArray[Any] | None:
-    """Return the given rows of a column, None without the column."""
-    return None if column is None else column[row]

@@ -17,23 +17,23 @@ images: need a calibration; stamped by names, a file, or the sweeps of the same 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Bool, Float
+from densify.geometry.types import Float
 from densify.readers import checks
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.readers.folder_config import NAME, CameraFiles, FolderConfig, SweepFiles
+from densify.readers.folder_config import NAME, CameraFiles, FolderConfig
 from densify.readers.point_fields import Columns, PointLayout, PointTimes, sample_columns
 from densify.readers.point_files import SUFFIXES, read_table
 from densify.readers.recorded_poses import PoseFile, PoseTrack, transform_from_world
 from densify.readers.stamped_files import NamedFile, Series, files_below, order_files, require_path
+from densify.readers.timeline import median_period_ns
 
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _SEARCH_DEPTH = 2  # levels of subfolders
@@ -41,146 +41,6 @@ _ASSUMED_HZ = 10.0
 _UNTIMED = (
     "times of points are left out: they are compensated, and no poses with stamps tell by how much"
 )
-
-
-@dataclass(frozen=True)
-class SweepColumns:
-    """The columns of the sweeps of a folder, and their meaning."""
-
-    series: Series  # files and stamps of the sweeps
-    settings: SweepFiles  # section ``sweeps`` of densify.yaml
-    config: Path | None  # path of densify.yaml, None if the folder has none
-    _point_stamps_ns: dict[int, int] = field(default_factory=dict)
-
-    def returns(self, frame: int, stamp_ns: int) -> Returns:
-        """Return all rows of a sweep in the lidar frame; ``stamp_ns`` is its reference time."""
-        path = self.series.paths[frame]
-        columns = self._columns(path)
-        returns, valid = self.layout.returns(columns, path, stamp_ns)
-        points = self.settings.scale_m * returns.points
-        if self.settings.axes is not None:
-            points = points @ self.settings.axes.T
-        lidar = self._lidar(path, columns, valid)
-        origins = self.settings.scanner_origins
-        return replace(returns, points=points, lidar=lidar, scanner_origins=origins)
-
-    @cached_property
-    def layout(self) -> PointLayout:
-        """The meaning of the columns, found in a few sweeps."""
-        frame, columns = next(iter(self._samples.items()))
-        path, settings = self.series.paths[frame], self.settings
-        quantities = ("intensity", "time", "lidar")
-        named = {
-            quantity: getattr(settings, quantity)
-            for quantity in quantities
-            if getattr(settings, quantity)
-        }
-        for quantity, name in named.items():
-            if name not in columns:
-                raise InputError(
-                    f"{self.config}: sweeps.{quantity}: got {name!r}, expected a column of "
-                    f"{path.name}: {', '.join(columns)}"
-                )
-        stamps_ns = self.series.stamps_ns
-        return PointLayout.find(
-            [*self._samples.values()],
-            path,
-            self.period_ns,
-            stamps_ns=None if stamps_ns is None else [stamps_ns[f] for f in self._samples],
-            named=named,
-            intensity_scale=settings.intensity_scale,
-            unit=settings.time_unit,
-            absolute=settings.time_is == "absolute" if settings.time_is else None,
-            reference=settings.reference,
-        )
-
-    def stamp_ns(self, frame: int) -> int:
-        """Return a sweep's stamp (ns), else an absolute time of its points, else frame x period."""
-        if self.series.stamps_ns is not None:
-            return self.series.stamps_ns[frame]
-        times = self._point_clock
-        if times is None:
-            return frame * self.period_ns
-        if frame not in self._point_stamps_ns:
-            path = self.series.paths[frame]
-            columns = self._columns(path)
-            stamp_ns = times.own_stamp_ns(columns[times.field]) if times.field in columns else None
-            if stamp_ns is None:
-                raise InputError(f"{path}: no time of a point in {times.field}, which others have")
-            self._point_stamps_ns[frame] = stamp_ns
-        return self._point_stamps_ns[frame]
-
-    @cached_property
-    def _point_clock(self) -> PointTimes | None:
-        """The column of absolute point times that replaces missing stamps, None without one."""
-        try:
-            times = self.layout.times
-        except InputError:  # raised again when a sweep is read
-            return None
-        return times if times is not None and times.absolute else None
-
-    @property
-    def stamped_by(self) -> str:
-        """The source of the stamps, for people."""
-        if self.series.stamped_by:
-            return self.series.stamped_by
-        if self._point_clock is not None:
-            return f"the times of the points ({self._point_clock.field})"
-        article = "the" if self.settings.rate_hz else "an assumed"
-        return f"number, at {article} {1e9 / self.period_ns:g} Hz (rate_hz)"
-
-    def assumed(self) -> list[str]:
-        """Return the assumptions about missing stamps, a sentence each."""
-        if self.series.stamps_ns or self._point_clock is not None or self.settings.rate_hz:
-            return []
-        return [
-            f"the sweeps have no stamps: they are taken for {1e9 / self.period_ns:g} Hz by their "
-            f"numbers; give rate_hz or stamps in densify.yaml"
-        ]
-
-    @cached_property
-    def period_ns(self) -> int:
-        """The median time between stamps in ns; without stamps, the period of the assumed rate."""
-        stamps_ns = list((self.series.stamps_ns or {}).values())
-        if len(stamps_ns) > 1:
-            return max(1, int(np.median(np.diff(stamps_ns))))
-        return round(1e9 / (self.settings.rate_hz or _ASSUMED_HZ))
-
-    def describe_columns(self) -> str:
-        """Return a text of the columns in use, and of the unused ones with ranges of values."""
-        used = {quantity: name for quantity, name in vars(self.layout.fields).items() if name}
-        unused = [
-            f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
-            for name, column in next(iter(self._samples.values())).items()
-            if name not in used.values()
-        ]
-        text = ", ".join(f"{quantity} = {name}" for quantity, name in used.items())
-        return f"{text}; not used: {', '.join(unused)}" if unused else text
-
-    @cached_property
-    def _samples(self) -> dict[int, Columns]:
-        """The columns of a few sweeps spread over the recording, by frame number."""
-        paths = self.series.paths
-        return sample_columns([*paths], lambda frame: self._columns(paths[frame]))
-
-    def _columns(self, path: Path) -> Columns:
-        """Read a file's numeric columns, (N,) each, with the other (N,) arrays of an .npz file."""
-        table = read_table(path, self.settings.columns)
-        beside = {
-            name: array for name, array in table.beside.items() if array.shape == (len(table),)
-        }
-        columns = {**table.columns, **beside}
-        return {name: column for name, column in columns.items() if column.dtype.kind in "fiu"}
-
-    def _lidar(self, path: Path, columns: Columns, valid: Bool) -> NDArray[np.uint8] | None:
-        """Return the (N,) scanner numbers, 0 for invalid rows; None without a column of them."""
-        name = self.layout.fields.lidar
-        if not name:
-            return None
-        numbers = np.where(valid, columns[name], 0)
-        if not np.isin(numbers, np.arange(256)).all():
-            raise InputError(f"{path}: {name}: expected the number of a scanner, 0 to 255")
-        return numbers.astype(np.uint8)
 
 
 def open_recording(path: Path, scene: str | None) -> Folder:
@@ -194,10 +54,11 @@ class Folder(FileSequence):
     def __init__(self, path: Path | str) -> None:
         folder = Path(path)
         self._config = FolderConfig.read(folder)
-        settings, cameras = self._config.sweeps, self._config.cameras
-        files = _find_sweeps(folder, settings.files)
-        sweeps = order_files(folder, files, settings.stamps, settings.stamps_unit)
-        self._columns = SweepColumns(sweeps, settings, self._config.path)
+        self._settings, cameras = self._config.sweeps, self._config.cameras
+        files = _find_sweeps(folder, self._settings.files)
+        sweeps = order_files(folder, files, self._settings.stamps, self._settings.stamps_unit)
+        self._sweep_stamps_ns, self._stamped_by = sweeps.stamps_ns, sweeps.stamped_by
+        self._point_stamps_ns: dict[int, int] = {}  # stamps made of point times, by frame
         images = {name: _find_images(folder, name, files) for name, files in cameras.items()}
         super().__init__(
             folder.resolve().name,
@@ -218,7 +79,7 @@ class Folder(FileSequence):
                     self._stamped_by_sweeps[name] = self._pairing(series.paths)
             self._exposed_ns[name] = {number: ns + shift_ns for number, ns in stamps_ns.items()}
         self._read_poses()
-        self._is_untimed = settings.compensated and self._track is None
+        self._is_untimed = self._settings.compensated and self._track is None
 
     def _pairing(self, images: Mapping[int, Path]) -> str:
         """Describe that images have the stamps of sweeps, though nobody asked for it."""
@@ -230,70 +91,11 @@ class Folder(FileSequence):
             text += "; if their rates differ, give the images' times (stamps in densify.yaml)"
         return text
 
-    def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep in nanoseconds."""
-        self.check_frame(frame)
-        return self._columns.stamp_ns(int(frame))
-
-    def gaps(self) -> list[str]:
-        """Return a sentence for each missing part, which says what is assumed instead."""
-        notes, drive = self._columns.assumed(), checks.drive_around(self.where)
-        if drive is not None:
-            notes.append(
-                f"{self.where} is a part of the KITTI drive {drive}: read alone it has no times of "
-                f"points, images and poses; give the drive"
-            )
-        if self._is_untimed:
-            notes.append(_UNTIMED)
-        return notes + [f"{name}: {text}" for name, text in self._stamped_by_sweeps.items()]
-
-    def findings(self) -> Sequence[tuple[str, str]]:
-        """Return what the reader detected, such as columns and stamps, as (name, text) pairs."""
-        layout, first = self._columns.layout, self._files[self.frames[0]]
-        lines = [
-            ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
-            ("fields", self._columns.describe_columns()),
-            ("intensity", f"divided by {layout.intensity_scale:g}"),
-            ("times", _UNTIMED if self._is_untimed else layout.time_words),
-            ("stamped by", self._columns.stamped_by),
-            *self._stamped_by_sweeps.items(),
-        ]
-        if self._poses is not None:
-            lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
-        used = {str(Path(config.files)) for config in self._config.cameras.values()}
-        for name, images in files_below(self.where, _IMAGE_SUFFIXES, _SEARCH_DEPTH).items():
-            if name not in used:
-                text = f"{name} holds {len(images)} images without a calibration"
-                lines.append(("no camera", text))
-        return lines
-
-    def _returns(self, frame: int) -> Returns:
-        stamp_ns = self.stamp_ns(frame)
-        returns = self._columns.returns(frame, stamp_ns)
-        if self._config.sweeps.frame == "poses":
-            if self._track is not None:
-                return self._track.undo_placement(returns, stamp_ns)
-            points = transform_from_world(returns.points, self._pose(frame))
-            return replace(returns, points=points, offset_ns=None)  # compensated to the pose
-        if not self._config.sweeps.compensated or returns.offset_ns is None:
-            return returns
-        if self._track is None:  # _is_untimed
-            return replace(returns, offset_ns=None)
-        points = self._track.undo_compensation(returns.points, stamp_ns, returns.offset_ns)
-        return replace(returns, points=points)
-
-    def _pose(self, frame: int) -> Float:
-        if self._track is not None:
-            return self._track.at(self.stamp_ns(frame))
-        if self._poses is not None:
-            return checks.find_entry(self._T_world_lidar, frame, "pose", self._poses.path)
-        return super()._pose(frame)
-
     def _read_poses(self) -> None:
         """Read the poses into ``_track`` if they have stamps, else by frame number."""
         settings = self._config.poses
         file = PoseFile.of_folder(self.where, settings.file, settings.stamps_unit, self._files)
-        if file is None and self._config.sweeps.frame == "poses":
+        if file is None and self._settings.frame == "poses":
             raise InputError(
                 f"{self._config.path}: sweeps.frame: got poses, but there are no poses; give those "
                 f"that placed the sweeps (poses: {{file: NAME}})"
@@ -309,21 +111,172 @@ class Folder(FileSequence):
         else:
             self._T_world_lidar = replace(file, T=T).by_frame(self.frames)
 
+    def gaps(self) -> list[str]:
+        """Return a sentence for each missing part, which says what is assumed instead."""
+        notes, drive = [], checks.drive_around(self.where)
+        if not (self._sweep_stamps_ns or self._point_clock or self._settings.rate_hz):
+            notes.append(
+                f"the sweeps have no stamps: they are taken for {1e9 / self._period_ns:g} Hz by "
+                f"their numbers; give rate_hz or stamps in densify.yaml"
+            )
+        if drive is not None:
+            notes.append(
+                f"{self.where} is a part of the KITTI drive {drive}: read alone it has no times of "
+                f"points, images and poses; give the drive"
+            )
+        if self._is_untimed:
+            notes.append(_UNTIMED)
+        return notes + [f"{name}: {text}" for name, text in self._stamped_by_sweeps.items()]
+
+    def findings(self) -> Sequence[tuple[str, str]]:
+        """Return what the reader detected, such as columns and stamps, as (name, text) pairs."""
+        layout, first = self._layout, self._files[self.frames[0]]
+        lines = [
+            ("files", f"{(first.parent / '*').relative_to(self.where)}{first.suffix}"),
+            ("fields", self._describe_columns()),
+            ("intensity", f"divided by {layout.intensity_scale:g}"),
+            ("times", _UNTIMED if self._is_untimed else layout.time_words),
+            ("stamped by", self._describe_stamps()),
+            *self._stamped_by_sweeps.items(),
+        ]
+        if self._poses is not None:
+            lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
+        used = {str(Path(config.files)) for config in self._config.cameras.values()}
+        for name, images in files_below(self.where, _IMAGE_SUFFIXES, _SEARCH_DEPTH).items():
+            if name not in used:
+                text = f"{name} holds {len(images)} images without a calibration"
+                lines.append(("no camera", text))
+        return lines
+
+    def _describe_columns(self) -> str:
+        """Return a text of the columns in use, and of the unused ones with ranges of values."""
+        unused = [
+            f"{name} ({np.nanmin(column):g} to {np.nanmax(column):g})"
+            for name, column in next(iter(self._samples.values())).items()
+            if name not in self._layout.fields.values()
+        ]
+        return f"{self._layout}; not used: {', '.join(unused)}" if unused else str(self._layout)
+
+    def _describe_stamps(self) -> str:
+        """Return the source of the stamps as text."""
+        if self._stamped_by:
+            return self._stamped_by
+        if self._point_clock is not None:
+            return f"the times of the points ({self._point_clock.field})"
+        article = "the" if self._settings.rate_hz else "an assumed"
+        return f"number, at {article} {1e9 / self._period_ns:g} Hz (rate_hz)"
+
+    def stamp_ns(self, frame: int) -> int:
+        """Return a sweep's stamp (ns), else an absolute time of its points, else frame x period."""
+        self.check_frame(frame)
+        if self._sweep_stamps_ns is not None:
+            return self._sweep_stamps_ns[frame]
+        times = self._point_clock
+        if times is None:
+            return int(frame) * self._period_ns
+        if frame not in self._point_stamps_ns:
+            path = self._files[frame]
+            columns = self._columns(path)
+            stamp_ns = times.own_stamp_ns(columns[times.field]) if times.field in columns else None
+            if stamp_ns is None:
+                raise InputError(f"{path}: no time of a point in {times.field}, which others have")
+            self._point_stamps_ns[frame] = stamp_ns
+        return self._point_stamps_ns[frame]
+
+    @cached_property
+    def _point_clock(self) -> PointTimes | None:
+        """The column of absolute point times that replaces missing stamps, None without one."""
+        try:
+            times = self._layout.times
+        except InputError:  # raised again when a sweep is read
+            return None
+        return times if times is not None and times.absolute else None
+
+    @cached_property
+    def _period_ns(self) -> int:
+        """The median time between stamps in ns; without stamps, the period of the assumed rate."""
+        assumed_ns = round(1e9 / (self._settings.rate_hz or _ASSUMED_HZ))
+        return median_period_ns([*(self._sweep_stamps_ns or {}).values()], assumed_ns)
+
+    @cached_property
+    def _layout(self) -> PointLayout:
+        """The meaning of the columns, found in a few sweeps."""
+        frame, columns = next(iter(self._samples.items()))
+        path, settings, stamps_ns = self._files[frame], self._settings, self._sweep_stamps_ns
+        named = {q: name for q in ("intensity", "time", "lidar") if (name := getattr(settings, q))}
+        for quantity, name in named.items():
+            if name not in columns:
+                raise InputError(
+                    f"{self._config.path}: sweeps.{quantity}: got {name!r}, expected a column of "
+                    f"{path.name}: {', '.join(columns)}"
+                )
+        return PointLayout.find(
+            [*self._samples.values()],
+            path,
+            self._period_ns,
+            stamps_ns=None if stamps_ns is None else [stamps_ns[f] for f in self._samples],
+            named=named,
+            intensity_scale=settings.intensity_scale,
+            unit=settings.time_unit,
+            absolute=settings.time_is == "absolute" if settings.time_is else None,
+            reference=settings.reference,
+        )
+
+    @cached_property
+    def _samples(self) -> dict[int, Columns]:
+        """The columns of a few sweeps spread over the recording, by frame number."""
+        return sample_columns(self.frames, lambda frame: self._columns(self._files[frame]))
+
+    def _columns(self, path: Path) -> Columns:
+        """Read the numeric columns (N,) of a file."""
+        columns = read_table(path, self._settings.columns)
+        return {name: column for name, column in columns.items() if column.dtype.kind in "fiu"}
+
+    def _returns(self, frame: int) -> Returns:
+        stamp_ns, path, settings = self.stamp_ns(frame), self._files[frame], self._settings
+        columns = self._columns(path)
+        returns = self._layout.returns(columns, path, stamp_ns)
+        lidar = None
+        if name := self._layout.fields.get("lidar"):
+            numbers = np.where(returns.points.any(axis=1), columns[name], 0)
+            if not np.isin(numbers, np.arange(256)).all():
+                raise InputError(f"{path}: {name}: expected the number of a scanner, 0 to 255")
+            lidar = numbers.astype(np.uint8)
+        points, origins = settings.scale_m * returns.points, settings.scanner_origins
+        if settings.axes is not None:
+            points = points @ settings.axes.T
+        returns = replace(returns, points=points, lidar=lidar, scanner_origins=origins)
+        if settings.frame == "poses":
+            if self._track is not None:
+                return self._track.undo_placement(returns, stamp_ns)
+            points = transform_from_world(points, self._pose(frame))
+            return replace(returns, points=points, offset_ns=None)  # compensated to the pose
+        if not settings.compensated or returns.offset_ns is None:
+            return returns
+        if self._track is None:  # _is_untimed
+            return replace(returns, offset_ns=None)
+        points = self._track.undo_compensation(points, stamp_ns, returns.offset_ns)
+        return replace(returns, points=points)
+
+    def _pose(self, frame: int) -> Float:
+        if self._track is not None:
+            return self._track.at(self.stamp_ns(frame))
+        if self._poses is not None:
+            return checks.find_entry(self._T_world_lidar, frame, "pose", self._poses.path)
+        return super()._pose(frame)
+
 
 def _find_sweeps(folder: Path, files: str) -> list[Path]:
     """Return the numbered point files in ``files`` ("": two levels deep), all of one suffix."""
     if files:
         require_path(folder, files, "sweeps: {files: ...}", is_folder=True)
     below = files_below(folder / files, SUFFIXES, 0 if files else _SEARCH_DEPTH)
-    numbered = {
-        name: [path for path in paths if _is_numbered(path)] for name, paths in below.items()
-    }
     for suffix in SUFFIXES:
         groups = {
-            name: [path for path in paths if path.suffix.lower() == suffix]
-            for name, paths in numbered.items()
+            name: numbered
+            for name, paths in below.items()
+            if (numbered := [p for p in paths if p.suffix.lower() == suffix and _is_numbered(p)])
         }
-        groups = {name: paths for name, paths in groups.items() if paths}
         if len(groups) > 1:
             raise InputError(
                 f"{folder}: several folders hold sweeps: {', '.join(groups)}; name one in "

@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -26,11 +26,10 @@ C = TypeVar("C")
 
 
 class Kind(NamedTuple):
-    """A kind of values: a function that converts them, and their description."""
+    """A kind of values in the YAML."""
 
-    # Converts the value in the YAML; raises an exception, such as ValueError, for a wrong one
-    convert: Callable[[Any], Any]
-    expected: str  # in words, for messages
+    convert: Callable[[Any], Any]  # returns the converted value; raises ValueError for a wrong one
+    expected: str  # description, for messages
 
     def key(self, default: Any = MISSING) -> Any:
         """Return a dataclass field for a YAML key of this kind, required without a default."""
@@ -70,11 +69,11 @@ def _axes(value: Any) -> Float:
 
 def _intrinsics(value: Any) -> Float:
     """Return the (3,3) camera matrix of fx fy cx cy or of nine numbers."""
-    numbers = _array(value, -1)
-    if len(numbers) == 4:
-        fx, fy, cx, cy = numbers
-        numbers = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
-    K = numbers.reshape(3, 3)
+    K = _array(value, -1)
+    if len(K) == 4:
+        fx, fy, cx, cy = K
+        K = np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1.0])
+    K = K.reshape(3, 3)
     has_zeros = np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1])
     return _require(min(K[0, 0], K[1, 1]) > 0 and has_zeros, K)
 
@@ -167,19 +166,10 @@ class CameraFiles:
 
     def camera(self, name: str) -> Camera:
         """Return the camera of this calibration with the given name."""
-        width_px, height_px = self.size
         is_bent = self.model != "pinhole" or any(self.distortion)
-        return Camera(
-            name,
-            width_px,
-            height_px,
-            self.K,
-            self.T_cam_lidar,
-            distortion=self.distortion if is_bent else (),
-            model=self.model,
-            max_angle_deg=self.max_angle_deg,
-            row_time_s=self.row_time_s,
-        )
+        distortion = self.distortion if is_bent else ()
+        camera = Camera(name, *self.size, self.K, self.T_cam_lidar, distortion, self.model)
+        return replace(camera, max_angle_deg=self.max_angle_deg, row_time_s=self.row_time_s)
 
 
 @dataclass(frozen=True)
@@ -230,26 +220,23 @@ class _File(NamedTuple):
             raise self.unfit(key, value, "a mapping of keys to values")
         for name in value:
             if known is not None and name not in known:
-                raise self.error(
-                    f"{key}.{name}".lstrip("."),
-                    f"unknown key; {did_you_mean(name, known)}expected some of "
-                    f"{', '.join(sorted(known))}",
-                )
+                expected = f"{did_you_mean(name, known)}expected some of {', '.join(sorted(known))}"
+                raise self.error(f"{key}.{name}".lstrip("."), f"unknown key; {expected}")
         return value
 
     def filled(self, section: type[C], key: str, value: Any) -> C:
         """Return a dataclass filled with the checked values of a YAML mapping."""
         known = {f.name: f for f in fields(section)}  # type: ignore[arg-type]
-        settings = {n: v for n, v in self.mapping(key, value, known).items() if v is not None}
+        settings = self.mapping(key, value, known)
         arguments = {}
         for name, knob in known.items():
-            convert, expected = knob.metadata["kind"]
+            (convert, expected), got = knob.metadata["kind"], settings.get(name)
             try:
-                if name in settings:
-                    arguments[name] = convert(settings[name])
+                if got is not None:
+                    arguments[name] = convert(got)
             except (ValueError, TypeError, KeyError, OverflowError, InputError):
-                raise self.unfit(f"{key}.{name}", settings[name], expected) from None
-            if knob.default is MISSING and name not in settings:
+                raise self.unfit(f"{key}.{name}", got, expected) from None
+            if got is None and knob.default is MISSING:
                 raise self.unfit(f"{key}.{name}", None, expected)
         return section(**arguments)
 

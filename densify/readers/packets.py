@@ -32,16 +32,8 @@ from densify.config.file_content import import_extra, open_file, read_json, reas
 from densify.geometry.types import Int
 from densify.readers.file_sequence import FileSequence, Returns
 
-MODELS = {
-    "VLP-16": "VLP16",
-    "Puck-Hi-Res": "PuckHiRes",
-    "HDL-32E": "HDL32E",
-    "VLP-32A": "VLP32A",
-    "VLP-32B": "VLP32B",
-    "VLP-32C": "VLP32C",
-    "VLS-128": "VLS128",
-}
-"""Names of Velodyne's models in the decoder, by the names that users give."""
+MODELS = ("VLP-16", "Puck-Hi-Res", "HDL-32E", "VLP-32A", "VLP-32B", "VLP-32C", "VLS-128")
+"""Velodyne's models; the decoder's names of them have no hyphens."""
 
 _PAYLOAD = 1206  # bytes of a Velodyne packet with returns
 _MAX_HEADERS = 64  # bytes of Ethernet, VLAN, IP and UDP headers before the packet
@@ -97,16 +89,11 @@ class Velodyne(FileSequence):
 
     def __init__(self, path: Path, model: str) -> None:
         self._library = import_extra("velodyne_decoder", "velodyne", "Velodyne captures")
-        self._model = getattr(self._library.Model, MODELS[model])
+        self._model = getattr(self._library.Model, model.replace("-", ""))
         packets, num_twice = _once(_find_packets(path))
         self._begin, self._captured_ns, azimuth, clock_us = packets
         self._packet_counts = len(azimuth), _num_lost(clock_us), num_twice
         self._turns = _turns(azimuth)
-        if not self._turns:
-            raise InputError(
-                f"{path}: no whole turn: got {len(azimuth)} packets of returns, expected those of "
-                f"a tenth of a second or more"
-            )
         self._stamps_ns = [int(self._captured_ns[turn.stop - 1]) for turn in self._turns]
         super().__init__(path.stem, path, range(len(self._turns)))
 
@@ -128,12 +115,9 @@ class Velodyne(FileSequence):
             raise InputError(
                 f"{self.where}: frame {frame} cannot be decoded: {error}; is it another model?"
             ) from error
-        intensity, time_s = columns[:, 3], columns[:, 4].astype(np.float64)
-        return Returns(
-            columns[:, :3].astype(np.float64),
-            (intensity / 255).astype(np.float32),
-            np.rint(time_s * 1e9).astype(np.int64),
-        )
+        offset_ns = np.rint(columns[:, 4].astype(np.float64) * 1e9).astype(np.int64)
+        intensity = (columns[:, 3] / 255).astype(np.float32)
+        return Returns(columns[:, :3].astype(np.float64), intensity, offset_ns)
 
 
 def _find_packets(path: Path) -> Int:
@@ -203,11 +187,8 @@ class Ouster(FileSequence):
     """An Ouster capture as a `LidarSequence`, stamped at the first packet of each sweep."""
 
     def __init__(self, path: Path, metadata: Path) -> None:
-        # The decoder's modules
-        core, pcap = (
-            import_extra(f"ouster.sdk.{name}", "ouster", "Ouster captures")
-            for name in ("core", "pcap")
-        )
+        core = import_extra("ouster.sdk.core", "ouster", "Ouster captures")
+        pcap = import_extra("ouster.sdk.pcap", "ouster", "Ouster captures")
         read_json(metadata)
         open_file(path).close()  # raises a clear error for an unreadable file
         try:
@@ -238,8 +219,8 @@ class Ouster(FileSequence):
         """Return one pair: "packets", and the numbers of packets read, lost and captured twice."""
         packets = [p for _, p in self._packets if isinstance(p, self._is_lidar_packet)]
         turn = np.array([p.frame_id() for p in packets], np.int64)
-        column = [int(p.format.packet_header(self._column, p.buf)[0]) for p in packets]
-        num_lost, num_twice = count_lost_and_repeated(turn, np.array(column, np.int64))
+        column = np.array([p.format.packet_header(self._column, p.buf)[0] for p in packets], int)
+        num_lost, num_twice = count_lost_and_repeated(turn, column)
         return _packet_counts(len(packets) - num_twice, num_lost, num_twice)
 
     def _returns(self, frame: int) -> Returns:
@@ -252,20 +233,17 @@ class Ouster(FileSequence):
                 f"window without it"
             ) from error
         measured = (scan.status & 1).astype(bool)
+        points[:, ~measured] = 0
         since_ns = np.zeros(scan.w, np.int64)
         if measured.any():
-            column_ns = scan.timestamp.astype(np.int64)
-            since_ns[measured] = column_ns[measured] - column_ns[measured].min()
-        points[:, ~measured] = 0
-        intensity = np.zeros((scan.h, scan.w))
+            column_ns = scan.timestamp.astype(np.int64)[measured]
+            since_ns[measured] = column_ns - column_ns.min()
+        offset_ns = np.broadcast_to(since_ns, (scan.h, scan.w)).reshape(-1)
+        intensity = None
         if scan.has_field("REFLECTIVITY"):
-            intensity = np.clip(scan.field("REFLECTIVITY") / 255, 0, 1)
-        return Returns(
-            points.reshape(-1, 3),
-            intensity.astype(np.float32).reshape(-1),
-            np.broadcast_to(since_ns, (scan.h, scan.w)).reshape(-1),
-            scanner_origins=self._origins_m,
-        )
+            intensity = np.clip(scan.field("REFLECTIVITY") / 255, 0, 1).astype(np.float32).ravel()
+        points, origins = points.reshape(-1, 3), self._origins_m
+        return Returns(points, intensity, offset_ns, scanner_origins=origins)
 
 
 def count_lost_and_repeated(turn: Int, column: Int) -> tuple[int, int]:

@@ -46,28 +46,15 @@ _LATEST_NS = 1 << 62  # the year 2116; differences of such times fit 64 bits
 _FULL_SCALES = (1.0, 255.0, 65535.0)
 
 
-@dataclass(frozen=True)
-class Fields:
-    """Names of the point fields that hold each quantity, "" if no field does."""
-
-    x: str = ""
-    y: str = ""
-    z: str = ""
-    intensity: str = ""
-    time: str = ""
-    ring: str = ""
-    lidar: str = ""
-
-
-def find_fields(names: Collection[str]) -> Fields:
-    """Return the field of each quantity by its usual names, in any case; "" without."""
+def find_fields(names: Collection[str]) -> dict[str, str]:
+    """Return the fields by the quantities that they hold, found by usual names in any case."""
     # CloudCompare puts scalar_ before the names of fields.
     lower = {name.lower().removeprefix("scalar_"): name for name in reversed(list(names))}
-    field_of_quantity = {
-        quantity: next((lower[name] for name in aliases.split() if name in lower), "")
-        for quantity, aliases in _NAMES.items()
-    }
-    return Fields(**field_of_quantity)
+    field_of_quantity = {}
+    for quantity, aliases in _NAMES.items():
+        if known := [lower[name] for name in aliases.split() if name in lower]:
+            field_of_quantity[quantity] = known[0]
+    return field_of_quantity
 
 
 @dataclass(frozen=True)
@@ -103,7 +90,12 @@ class PointTimes:
 
     def _times_ns(self, values: NDArray[Any], stamp_ns: int | None) -> tuple[Int, Bool]:
         """Return (N,) times in ns and a mask of those within `reach_ns` of the sweep's middle."""
-        times_ns, is_valid = _in_ns(values, self.unit)
+        unit_ns = UNIT_NS[self.unit]
+        with np.errstate(invalid="ignore"):
+            is_valid: Bool = np.abs(values.astype(np.float64)) < _LATEST_NS / unit_ns
+        values = np.where(is_valid, values, 0)
+        whole = values.astype(np.int64)  # converted as integers, to keep every digit
+        times_ns = whole * unit_ns + np.rint((values - whole) * unit_ns).astype(np.int64)
         middle_ns = self.middle_ns + (stamp_ns or 0) * self.absolute
         if (self.other_clock or stamp_ns is None) and is_valid.any():
             middle_ns = round(_extent(times_ns[is_valid])[0])
@@ -119,16 +111,6 @@ class PointTimes:
         if self.other_clock and not self.reference:
             text += ", by another clock than the stamps: the first point is taken for the stamp's"
         return text + (f", the stamp is the {self.reference}" if self.reference else "")
-
-
-def _in_ns(values: NDArray[Any], unit: str) -> tuple[Int, Bool]:
-    """Return (N,) times in ns, and a mask of those that are finite numbers below `_LATEST_NS`."""
-    with np.errstate(invalid="ignore"):
-        is_valid: Bool = np.abs(values.astype(np.float64)) < _LATEST_NS / UNIT_NS[unit]
-    values = np.where(is_valid, values, 0)
-    whole = values.astype(np.int64)  # converted as integers, to keep every digit
-    fraction_ns = np.rint((values - whole) * UNIT_NS[unit]).astype(np.int64)
-    return whole * UNIT_NS[unit] + fraction_ns, is_valid
 
 
 def _extent(times: NDArray[Any]) -> tuple[float, float]:
@@ -184,10 +166,11 @@ def find_times(
         period_ns: Time between consecutive sweeps.
         stamps_ns: Stamp of each of these sweeps, None without stamps.
     """
-    finite = [values[np.isfinite(values)] for values in sweeps]
-    extents = np.array([_extent(values) for values in finite if len(values)] or [(0.0, 0.0)])
+    timed = [row for row, values in enumerate(sweeps) if np.isfinite(values).any()]
+    finite = [sweeps[row][np.isfinite(sweeps[row])] for row in timed]
+    extents = np.array([_extent(values) for values in finite] or [(0.0, 0.0)])
     middle, reach = np.median(extents, axis=0).tolist()
-    span = max(float(np.ptp(values)) for values in finite) if any(map(len, finite)) else 0.0
+    span = max((float(np.ptp(values)) for values in finite), default=0.0)
     name, dtype = field.name, sweeps[0].dtype
 
     # Times that cannot be used: too few digits, all equal, or a span of no unit
@@ -216,8 +199,8 @@ def find_times(
 
     # The middle of the times since the stamp
     if absolute and stamps_ns is not None:
-        stamps_of_timed = [ns for ns, values in zip(stamps_ns, finite, strict=True) if len(values)]
-        middle_ns = float(np.median(middles_ns - np.array(stamps_of_timed, np.float64)))
+        timed_ns = np.array([stamps_ns[row] for row in timed], np.float64)
+        middle_ns = float(np.median(middles_ns - timed_ns))
     elif absolute:  # the stamps are made of these times
         middle_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
     point_times = PointTimes(
@@ -254,10 +237,13 @@ def rescale(intensity: NDArray[Any], scale: float) -> Float32:
 class PointLayout:
     """The meaning of the fields in a sensor's sweeps."""
 
-    fields: Fields
+    fields: Mapping[str, str]  # name of the field of each quantity, as in `find_fields`
     times: PointTimes | None  # meaning of the point times, None without usable times
     time_words: str  # description of the times, or the reason why there are none
     intensity_scale: float  # divisor that scales intensities to 0 to 1
+
+    def __str__(self) -> str:
+        return ", ".join(f"{quantity} = {name}" for quantity, name in self.fields.items())
 
     @staticmethod
     def find(
@@ -280,8 +266,9 @@ class PointLayout:
             intensity_scale: Divisor of intensities that the user states, 0 to find it.
             **times: unit, absolute or reference that the user states, as in `TimeField`.
         """
-        fields = Fields(**(vars(find_fields(sweeps[0])) | dict(named or {})))
-        missing = [axis for axis in "xyz" if not getattr(fields, axis)]
+        found = find_fields(sweeps[0]) | dict(named or {})
+        fields = {quantity: found[quantity] for quantity in _NAMES if quantity in found}
+        missing = [axis for axis in "xyz" if axis not in fields]
         if missing:
             raise InputError(
                 f"{where}: no column {', '.join(missing)}: got {', '.join(sweeps[0])}; in a plain "
@@ -289,39 +276,37 @@ class PointLayout:
             )
         alike = [row for row, columns in enumerate(sweeps) if columns.keys() == sweeps[0].keys()]
         point_times, words = None, "none: no column of that kind"
-        if fields.time:
-            values = [sweeps[row][fields.time] for row in alike]
+        if "time" in fields:
+            values = [sweeps[row][fields["time"]] for row in alike]
             stamps_ns = None if stamps_ns is None else [stamps_ns[row] for row in alike]
-            field = TimeField(fields.time, **times)
+            field = TimeField(fields["time"], **times)
             point_times, words = find_times(field, values, period_ns, stamps_ns)
-        if fields.intensity and not intensity_scale:
-            intensity_scale = max(full_scale(sweeps[row][fields.intensity]) for row in alike)
+        if "intensity" in fields and not intensity_scale:
+            intensity_scale = max(full_scale(sweeps[row][fields["intensity"]]) for row in alike)
         return PointLayout(fields, point_times, words, intensity_scale or 1.0)
 
-    def returns(self, columns: Columns, where: Path | str, stamp_ns: int) -> tuple[Returns, Bool]:
-        """Return all N rows of a sweep, and a mask (N,) of the valid rows.
+    def returns(self, columns: Columns, where: Path | str, stamp_ns: int) -> Returns:
+        """Return all N rows of a sweep, invalid ones at 0 0 0.
 
-        Valid rows have a finite position, not 0 0 0, and a time inside the sweep; others get 0 0 0.
-        Raise InputError, whose message begins with ``where``, if a column is missing.
+        Valid rows have a finite position, not 0 0 0, and a time inside the sweep. Raise InputError,
+        whose message begins with ``where``, if a column is missing.
         """
-        missing = [name for name in vars(self.fields).values() if name and name not in columns]
+        missing = [name for name in self.fields.values() if name not in columns]
         if missing:
             raise InputError(
                 f"{where}: no column {missing[0]}, which other sweeps have; got "
                 f"{', '.join(columns)}"
             )
-        axes = (self.fields.x, self.fields.y, self.fields.z)
-        points = np.column_stack([columns[name] for name in axes]).astype(np.float64)
+        column_of = {quantity: columns[name] for quantity, name in self.fields.items()}
+        points = np.column_stack([column_of[axis] for axis in "xyz"]).astype(np.float64)
         valid: Bool = np.logical_and(np.isfinite(points).all(axis=1), points.any(axis=1))
-        if self.fields.lidar:
-            valid &= np.isfinite(columns[self.fields.lidar])
-        intensity = None
-        if self.fields.intensity:
-            intensity = rescale(columns[self.fields.intensity], self.intensity_scale)
+        if "lidar" in column_of:
+            valid &= np.isfinite(column_of["lidar"])
+        intensity = rescale(column_of.get("intensity", np.zeros(len(points))), self.intensity_scale)
         offset_ns = None
         num_untimed = 0
         if self.times is not None:
-            values = columns[self.times.field][valid]
+            values = column_of["time"][valid]
             if len(values) and (values != values[0]).any():  # else this sweep has no times
                 valid_ns, is_in_sweep = self.times.offset_ns(values, stamp_ns)
                 offset_ns = np.zeros(len(points), np.int64)
@@ -329,4 +314,4 @@ class PointLayout:
                 valid[valid] = is_in_sweep
                 num_untimed = int((~is_in_sweep).sum())
         points[~valid] = 0
-        return Returns(points, intensity, offset_ns, num_untimed=num_untimed), valid
+        return Returns(points, intensity, offset_ns, num_untimed=num_untimed)

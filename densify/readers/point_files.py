@@ -8,7 +8,6 @@ import io
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,30 +38,17 @@ _BIN_LAYOUTS = {
 _MOST_RINGS, _MOST_ELONGATION, _MOST_ASCENDING = 256, 2.0, 0.9
 
 
-@dataclass(frozen=True)
-class PointTable:
-    """The N points of a file; ``len()`` is N."""
-
-    # Values (N,) of each column as stored, by name. Columns without a name in the file are x, y, z,
-    # intensity, column4, column5 and so on.
-    columns: Columns
-    # Further arrays of an .npz file, by name
-    beside: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(next(iter(self.columns.values()), ()))
-
-
-def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
-    """Return all rows of a point file, in file order; raise InputError if damaged or without rows.
+def read_table(path: Path, names: Sequence[str] | None = None) -> Columns:
+    """Return the columns (N,) of a point file, as stored, in file order.
 
     ``names`` are the names of the columns in .bin, .csv, .txt and unstructured arrays. None takes
-    the names of the first line, or x, y, z, intensity, column4, column5 and so on.
+    the names of the first line, or x, y, z, intensity, column4, column5 and so on. Raise InputError
+    if the file is damaged or holds no points.
 
     .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
                 values fit one of them
     .npy, .npz  an (N,3 or more) array, in an .npz called ``points``; or organised (H,W,3 or more);
-                or structured; or an .npz of x, y, z and others, (N,) each
+                or structured; or an .npz of x, y, z. Other arrays (N,) of an .npz are columns too.
     .csv, .txt  numbers, NaN where blank; a first line of words names the columns
     .pcd        ascii, binary, binary_compressed
     .ply        properties of its vertices (extra ``ply``)
@@ -74,21 +60,15 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> PointTable:
             f"{path}: got {path.suffix or 'no suffix'}, expected one of {', '.join(SUFFIXES)}"
         )
     try:
-        table = _READERS[suffix](path, names)
+        columns = _READERS[suffix](path, names)
     except InputError:
         raise
     except Exception as error:  # parsers raise anything on a damaged file
         said = f"it has no {error}" if isinstance(error, KeyError) else reason(error)
         raise InputError(f"{path}: not a readable {suffix} point file: {said}") from error
-    if not len(table):
+    if not len(next(iter(columns.values()), ())):
         raise InputError(f"{path}: holds no points, expected at least one")
-    return table
-
-
-def _default_column_names(num_columns: int) -> tuple[str, ...]:
-    """Return default column names: x, y, z, intensity, column4, column5 and so on."""
-    numbered = (f"column{number}" for number in range(len(_UNNAMED), num_columns))
-    return (*_UNNAMED[:num_columns], *numbered)
+    return columns
 
 
 def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Columns:
@@ -107,15 +87,17 @@ def _matrix(array: NDArray[Any], names: Sequence[str] | None, path: Path) -> Col
             f"{path}: got an array of shape {array.shape} and type {array.dtype}, expected numbers "
             f"of shape (N,3) or more columns, {_MOST_COLUMNS} at most"
         )
-    names = _default_column_names(array.shape[1]) if names is None else names
-    if len(names) != array.shape[1]:
+    num_columns = array.shape[1]
+    if names is None:
+        names = [*_UNNAMED, *(f"column{number}" for number in range(4, num_columns))][:num_columns]
+    if len(names) != num_columns:
         raise InputError(
-            f"{path}: got {array.shape[1]} columns, expected {len(names)}: {' '.join(names)}"
+            f"{path}: got {num_columns} columns, expected {len(names)}: {' '.join(names)}"
         )
     return {name: array[:, column] for column, name in enumerate(names)}
 
 
-def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
+def _read_bin(path: Path, names: Sequence[str] | None) -> Columns:
     """Read float32 columns of the named columns, or of the known layout that fits."""
     data = read_bytes(path)
     if names is None:
@@ -136,7 +118,7 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> PointTable:
             "read as rows of 4 little-endian float32 columns, neighbouring points are not alike; "
             f"if it has other columns, {_NAME_COLUMNS}"
         )
-    return PointTable(_matrix(rows, names, path))
+    return _matrix(rows, names, path)
 
 
 def _fits(data: bytes, num_columns: int) -> bool:
@@ -168,28 +150,25 @@ def _are_scanned(points: NDArray[Any]) -> bool:
     return len(finite) < _FEWEST_ROWS or 0 < np.median(share) < _ALIKE
 
 
-def _read_npy(path: Path, names: Sequence[str] | None) -> PointTable:
+def _read_npy(path: Path, names: Sequence[str] | None) -> Columns:
     """Read a .npy or .npz file."""
     if path.suffix.lower() == ".npy":
-        return PointTable(_matrix(read_array(path), names, path))
+        return _matrix(read_array(path), names, path)
     arrays = read_arrays(path)
     if "points" in arrays:
-        return PointTable(_matrix(arrays.pop("points"), names, path), beside=arrays)
-    if not {"x", "y", "z"} <= arrays.keys():
+        columns = _matrix(arrays.pop("points"), names, path)
+        shape = next(iter(columns.values()), np.zeros(0)).shape
+    elif {"x", "y", "z"} <= arrays.keys():
+        columns, shape = {}, arrays["x"].shape
+        if len(shape) != 1 or any(arrays[axis].shape != shape for axis in "yz"):
+            raise ValueError("the arrays x, y and z have other shapes than (N,)")
+    else:
         raise ValueError(f"holds the arrays {', '.join(arrays)}, expected points, or x, y and z")
-    num_points = arrays["x"].shape
-    if len(num_points) != 1 or any(arrays[axis].shape != num_points for axis in "yz"):
-        raise ValueError("the arrays x, y and z have other shapes than (N,)")
-    columns = {
-        name: array
-        for name, array in arrays.items()
-        if array.shape == num_points and array.dtype.kind in "fiu"
-    }
-    others = {name: array for name, array in arrays.items() if name not in columns}
-    return PointTable(columns, beside=others)
+    beside = {name: array for name, array in arrays.items() if array.shape == shape}
+    return columns | {name: array for name, array in beside.items() if array.dtype.kind in "fiu"}
 
 
-def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
+def _read_text(path: Path, names: Sequence[str] | None) -> Columns:
     """Read a .csv or .txt file."""
     lines = decode_text(read_bytes(path), path).splitlines()
     skip, words, delimiter = _header(lines)
@@ -208,7 +187,7 @@ def _read_text(path: Path, names: Sequence[str] | None) -> PointTable:
             line = lines[skip - 1][:60]
             raise ValueError(f"got the first line {line!r}, expected names such as x,y,z")
         names = words
-    return PointTable(_matrix(array, names, path))
+    return _matrix(array, names, path)
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[str], str | None]:
@@ -239,17 +218,14 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 def _pcd_header(file: Any) -> list[str]:
     """Read the header up to DATA for the parser: no padding fields, nothing optional missing."""
-    lines: list[str] = []
-    while len(lines) < 20:
+    table: dict[str, list[str]] = {}
+    while "DATA" not in table and len(table) < 20:
         raw = file.readline(65536)
         if not raw:
             raise ValueError("the header ends before DATA; it is cut off")
-        line = raw.decode("ascii", errors="strict").strip()
-        if line and not line.startswith("#"):
-            lines.append(line)
-        if line.startswith("DATA"):
-            break
-    table = {line.split()[0]: line.split()[1:] for line in lines}
+        words = raw.decode("ascii").split()
+        if words and not words[0].startswith("#"):
+            table[words[0]] = words[1:]
     missing = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA") if not table.get(key)]
     if missing:
         raise ValueError(f"the header has no {', '.join(missing)}")
@@ -265,21 +241,20 @@ def _pcd_header(file: Any) -> list[str]:
         raise ValueError(
             "the header names " + ", ".join(f"{len(table[key])} {key}" for key in per_field)
         )
+    if not all(re.fullmatch(r"[0-9]{1,4}", count) for count in table["COUNT"]):
+        raise ValueError("COUNT: expected a small whole number for each field")
     kept = [i for i, count in enumerate(table["COUNT"]) if count != "0"]
     table |= {key: [table[key][i] for i in kept] for key in per_field}
     data = table.pop("DATA")
     return [f"{key} {' '.join(values)}" for key, values in table.items()] + [f"DATA {data[0]}"]
 
 
-def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
+def _read_pcd(path: Path, names: Sequence[str] | None) -> Columns:
     """Read a .pcd file."""
     from pypcd4 import PointCloud
 
     file = io.BytesIO(read_bytes(path).removeprefix(codecs.BOM_UTF8))
     header = _pcd_header(file)
-    counts = next((line.split()[1:] for line in header if line.startswith("COUNT")), [])
-    if not all(word.isascii() and word.isdigit() and len(word) < 5 for word in counts):
-        raise ValueError("COUNT: expected a small whole number for each field")
     body = file.read()
     if header[-1] == "DATA ascii":  # one blank between numbers, none at the end
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines())
@@ -295,11 +270,10 @@ def _read_pcd(path: Path, names: Sequence[str] | None) -> PointTable:
         raise ValueError(
             f"got {len(rows)} points, expected {cloud.points} as its header says; it is cut off"
         )
-    columns = {name: rows[name] for name in rows.dtype.names or () if not name.startswith("#")}
-    return PointTable(columns)
+    return {name: rows[name] for name in rows.dtype.names or () if not name.startswith("#")}
 
 
-def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
+def _read_ply(path: Path, names: Sequence[str] | None) -> Columns:
     """Read the vertices of a .ply file."""
     ply = import_extra("trimesh.exchange.ply", "ply", ".ply files")
     file = io.BytesIO(read_bytes(path).removeprefix(codecs.BOM_UTF8))
@@ -310,18 +284,18 @@ def _read_ply(path: Path, names: Sequence[str] | None) -> PointTable:
         raise ValueError(f"holds fewer than the {vertex['length']} vertices of its header")
     if any(column.dtype.kind not in "fiub" for column in columns.values()):
         raise ValueError("its vertices are no numbers")
-    return PointTable(columns)
+    return columns
 
 
-def _read_las(path: Path, names: Sequence[str] | None) -> PointTable:
+def _read_las(path: Path, names: Sequence[str] | None) -> Columns:
     """Read the dimensions of a .las or .laz file."""
     cloud = read_las(path)
     coordinates = {axis: np.asarray(getattr(cloud, axis)) for axis in "xyz"}
     attributes = [n for n in cloud.point_format.dimension_names if n not in ("X", "Y", "Z")]
-    return PointTable(coordinates | {name: np.asarray(cloud[name]) for name in attributes})
+    return coordinates | {name: np.asarray(cloud[name]) for name in attributes}
 
 
-_READERS: Mapping[str, Callable[[Path, Sequence[str] | None], PointTable]] = {
+_READERS: Mapping[str, Callable[[Path, Sequence[str] | None], Columns]] = {
     ".pcd": _read_pcd,
     ".bin": _read_bin,
     ".ply": _read_ply,

@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,31 +32,16 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float
-from densify.readers import checks
+from densify.readers import checks, ros_bag
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.point_fields import PointLayout, sample_columns
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.ros_bag import (
-    CLOUDS,
-    IMAGES,
-    TRANSFORMS,
-    Bag,
-    Entry,
-    Topic,
-    camera_of,
-    check_encoding,
-    cloud_columns,
-    image_rgb,
-)
+from densify.readers.ros_bag import CLOUDS, IMAGES, Bag, Entry, Topic
+from densify.readers.timeline import median_period_ns
 
-_USUAL_PERIOD_NS = 100_000_000
 _FIXED_M = 1e-6  # frames that move less, in metres or radians, are fixed
 _ODOMETRY = "nav_msgs/msg/Odometry"
-_POSES = (
-    _ODOMETRY,
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-)
+_POSES = (_ODOMETRY, *(f"geometry_msgs/msg/Pose{kind}Stamped" for kind in ("", "WithCovariance")))
 _TYPES = {"points": CLOUDS, "images": IMAGES, "poses": _POSES}  # of messages, by option
 _USAGE = "#points=/topic,/topic&images=/topic,/topic&poses=/topic, tf or none"
 _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
@@ -83,9 +68,8 @@ class Topics(NamedTuple):
         named = dict(parse_qsl(options or "", keep_blank_values=True))
         unknown = [key for key in named if key not in _TYPES]
         if unknown or (options and not named):
-            raise InputError(
-                f"{bag.path}#{options}: got {unknown[0] if unknown else options}, expected {_USAGE}"
-            )
+            got = unknown[0] if unknown else options
+            raise InputError(f"{bag.path}#{options}: got {got}, expected {_USAGE}")
         chosen = {
             key: [name for name in text.split(",") if name not in ("", "none")]
             for key, text in named.items()
@@ -119,7 +103,7 @@ def _only_cloud(bag: Bag) -> str:
             f"or all lidars of the vehicle: --data 'ros:{bag.path}#points=/topic,/topic'"
         )
     raise InputError(
-        f"{bag.path}: no PointCloud2; got {_listed(list(bag.topics.values())) or 'no messages'}; "
+        f"{bag.path}: no PointCloud2; got {_listed(bag.topics.values()) or 'no messages'}; "
         f"play raw packets through the sensor's driver and record the points that come out"
     )
 
@@ -138,52 +122,43 @@ def _namespace(topic: str) -> str:
     return topic.removesuffix("/compressed").rpartition("/")[0]
 
 
-def _listed(topics: Sequence[Topic]) -> str:
+def _listed(topics: Iterable[Topic]) -> str:
     return ", ".join(f"{t.name} ({t.type.rpartition('/')[2]}, {t.num_messages})" for t in topics)
 
 
 # Frames and poses
 
 
-@dataclass(frozen=True)
 class Transforms:
-    """The tree of coordinate frames of a bag."""
+    """The tree of coordinate frames of a bag; a frame that never moves in /tf is fixed."""
 
-    where: str  # path of the bag, for messages
-    # Name of the parent frame and the constant pose T_parent_child (4,4), by child frame
-    fixed: dict[str, tuple[str, Float]] = field(default_factory=dict)
-    # Name of the parent frame and the path T_parent_child over time, by child frame
-    moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
-
-    @staticmethod
-    def read(bag: Bag) -> Transforms:
-        """Return all transforms of /tf_static and /tf; a frame that never moves in /tf is fixed."""
-        tree = Transforms(str(bag.path))
+    def __init__(self, bag: Bag) -> None:
+        """Read all transforms of /tf_static and /tf."""
+        self._path = bag.path
+        # Name of the parent frame and the constant pose T_parent_child (4,4), by child frame
+        self._fixed: dict[str, tuple[str, Float]] = {}
+        # Name of the parent frame and the path T_parent_child over time, by child frame
+        self._moving: dict[str, tuple[str, PoseTrack]] = {}
         recorded: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
-        for topic in bag.of_type(*TRANSFORMS):
-            transforms = (
-                transform
-                for message in bag.messages(topic.name)
-                for transform in message.transforms
-            )
-            for transform in transforms:
+        for topic in bag.of_type(*ros_bag.TRANSFORMS):
+            messages = bag.messages(topic.name)
+            for transform in (t for message in messages for t in message.transforms):
                 parent, child = _plain(transform.header.frame_id), _plain(transform.child_frame_id)
                 where = f"{bag.path}: {topic.name}: {parent} to {child}"
                 T = _pose(transform.transform.translation, transform.transform.rotation, where)
                 if topic.name.endswith("tf_static"):
-                    tree.fixed[child] = (parent, T)
+                    self._fixed[child] = (parent, T)
                 else:
                     recorded[parent, child][_stamp_ns(transform.header)] = T
         for (parent, child), T_at_stamp in recorded.items():
             T = np.stack([*T_at_stamp.values()])
-            if child in tree.fixed:
+            if child in self._fixed:
                 continue
             if np.abs(T - T[0]).max() < _FIXED_M:
-                tree.fixed[child] = (parent, T[0])
+                self._fixed[child] = (parent, T[0])
             else:
                 track = _track(f"{bag.path}: /tf: {parent} to {child}", T_at_stamp)
-                tree.moving[child] = (parent, track)
-        return tree
+                self._moving[child] = (parent, track)
 
     def between(self, target: str, source: str) -> Float | None:
         """Return the constant T_target_source (4,4); None if no fixed frames join the two."""
@@ -197,18 +172,18 @@ class Transforms:
         """Return a frame's moving parent and T_parent_frame over time; None if nothing moves."""
         # The nearest moving parent is usually odom, not map, which jumps at loop closures.
         for body, T_body_frame in self._above(frame).items():
-            if body in self.moving:
-                world, track = self.moving[body]
+            if body in self._moving:
+                world, track = self._moving[body]
                 return world, replace(track, T_world_ego=track.T_world_ego @ T_body_frame)
         return None
 
     def _above(self, frame: str) -> dict[str, Float]:
         """Return T_ancestor_frame (4,4) of a frame and all frames above it that are fixed to it."""
         T_ancestor_frame, ancestor = {frame: np.eye(4)}, frame
-        while ancestor in self.fixed:
-            parent, T = self.fixed[ancestor]
+        while ancestor in self._fixed:
+            parent, T = self._fixed[ancestor]
             if parent in T_ancestor_frame:
-                raise InputError(f"{self.where}: /tf_static: {parent} is above itself")
+                raise InputError(f"{self._path}: /tf_static: {parent} is above itself")
             T_ancestor_frame[parent] = T @ T_ancestor_frame[ancestor]
             ancestor = parent
         return T_ancestor_frame
@@ -274,13 +249,13 @@ class RosBag(FileSequence):
         self._bag = Bag(path)
         self._topics = topics = Topics.choose(self._bag, options)
         self._index = self._bag.index([*topics.points, *topics.images])
-        self._transforms = Transforms.read(self._bag)
+        self._transforms = Transforms(self._bag)
         self._lidars: list[Lidar] = []
         for topic in topics.points:
             self._lidars.append(self._lidar(topic))
         self._image_topics: dict[str, str] = {}
         self._unusable: list[str] = []  # reasons why topics of images are left out
-        cameras = {}
+        cameras, exposed_ns = {}, {}
         for topic in topics.images:
             try:
                 camera = self._camera(topic)
@@ -291,10 +266,8 @@ class RosBag(FileSequence):
                 continue
             self._check_size(camera, topic)
             cameras[camera.name], self._image_topics[camera.name] = camera, topic
-        exposed_ns = {
-            name: {number: entry.stamp_ns for number, entry in enumerate(self._index[topic])}
-            for name, topic in self._image_topics.items()
-        }
+            stamps_ns = [entry.stamp_ns for entry in self._index[topic]]
+            exposed_ns[camera.name] = dict(enumerate(stamps_ns))
         self._stamps_ns = [entry.stamp_ns for entry in self._lidars[0].entries]
         truth = checks.truth_beside(path if path.is_dir() else path.parent)
         frames = range(len(self._stamps_ns))
@@ -305,11 +278,9 @@ class RosBag(FileSequence):
         lines = []
         for lidar in self._lidars:
             layout, undone = lidar.layout, f", out of the world of {self._topics.poses}"
-            fields = [f"{key} = {name}" for key, name in vars(layout.fields).items() if name]
-            text = f"{lidar.topic} in {lidar.frame}{undone * lidar.placed}: {', '.join(fields)}"
-            lines.append(("lidar", text))
+            text = f"{lidar.topic} in {lidar.frame}{undone * lidar.placed}: {layout}"
             scale = f"intensity divided by {layout.intensity_scale:g}"
-            lines.append(("times", f"{layout.time_words}; {scale}"))
+            lines += [("lidar", text), ("times", f"{layout.time_words}; {scale}")]
         lines += [("images", f"{topic} ({name})") for name, topic in self._image_topics.items()]
         lines += [("no camera", text) for text in self._unusable]
         return [*lines, ("poses from", self._track_and_source[1])]
@@ -330,26 +301,20 @@ class RosBag(FileSequence):
     def _returns(self, frame: int) -> Returns:
         # The message of the first lidar, and those of other lidars nearest in time
         stamp_ns = self._stamps_ns[frame]
-        numbered_clouds: list[tuple[int, Returns]] = []
+        clouds: list[Returns] = []
         for number, lidar in enumerate(self._lidars):
-            entry = min(lidar.entries, key=lambda entry: abs(entry.stamp_ns - stamp_ns))
-            entry = entry if number else lidar.entries[frame]
+            nearest = min(lidar.entries, key=lambda entry: abs(entry.stamp_ns - stamp_ns))
+            entry = nearest if number else lidar.entries[frame]
             if abs(entry.stamp_ns - stamp_ns) <= self._lidars[0].period_ns // 2:
-                numbered_clouds.append((number, self._returns_of(lidar, entry, stamp_ns)))
-        clouds = [cloud for _, cloud in numbered_clouds]
-        offsets_ns = [cloud.offset_ns for cloud in clouds if cloud.offset_ns is not None]
-        intensities = [
-            np.zeros(len(cloud.points), np.float32) if cloud.intensity is None else cloud.intensity
-            for cloud in clouds
-        ]
+                cloud = self._returns_of(lidar, entry, stamp_ns)
+                numbers = np.full(len(cloud.points), number, np.uint8)
+                clouds.append(replace(cloud, lidar=numbers))
+        names = ["points", "intensity", "lidar"]
+        if all(cloud.offset_ns is not None for cloud in clouds):
+            names.append("offset_ns")
         origins = np.stack([lidar.T_first_lidar[:3, 3] for lidar in self._lidars])
         return Returns(
-            np.concatenate([cloud.points for cloud in clouds]),
-            np.concatenate(intensities),
-            np.concatenate(offsets_ns) if len(offsets_ns) == len(clouds) else None,
-            lidar=np.concatenate(
-                [np.full(len(cloud.points), number, np.uint8) for number, cloud in numbered_clouds]
-            ),
+            **{name: np.concatenate([getattr(cloud, name) for cloud in clouds]) for name in names},
             scanner_origins=origins if len(self._lidars) > 1 else None,
             num_untimed=sum(cloud.num_untimed for cloud in clouds),
         )
@@ -357,8 +322,9 @@ class RosBag(FileSequence):
     def _returns_of(self, lidar: Lidar, entry: Entry, stamp_ns: int) -> Returns:
         """Return a message's points in the first lidar's frame, with times since ``stamp_ns``."""
         where = f"{self._bag.path}: {lidar.topic} at {entry.stamp_ns} ns"
-        columns = cloud_columns(self._bag.message(lidar.topic, entry), where)
-        returns, valid = lidar.layout.returns(columns, where, entry.stamp_ns)
+        columns = ros_bag.cloud_columns(self._bag.message(lidar.topic, entry), where)
+        returns = lidar.layout.returns(columns, where, entry.stamp_ns)
+        valid = returns.points.any(axis=1)
         if lidar.placed:
             track, source = self._track_and_source
             if track is None:
@@ -374,7 +340,7 @@ class RosBag(FileSequence):
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         topic = self._image_topics[camera.name]
         where = f"{self._bag.path}: {topic}: image {number}"
-        rgb = image_rgb(self._bag.message(topic, self._index[topic][number]), where)
+        rgb = ros_bag.image_rgb(self._bag.message(topic, self._index[topic][number]), where)
         checks.check_image_size(rgb.shape, camera, where)
         return rgb
 
@@ -410,7 +376,7 @@ class RosBag(FileSequence):
         """Find frame, mounting and point fields of a lidar from some of its messages."""
         where, entries = f"{self._bag.path}: {topic}", self._index[topic]
         columns_of_entry = sample_columns(
-            entries, lambda entry: cloud_columns(self._bag.message(topic, entry), where)
+            entries, lambda entry: ros_bag.cloud_columns(self._bag.message(topic, entry), where)
         )
         if not columns_of_entry:
             raise InputError(f"{where}: the messages looked at hold no points")
@@ -424,8 +390,7 @@ class RosBag(FileSequence):
                 f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} to "
                 f"{first}; name the topic of one lidar: #points={topic}"
             )
-        steps_ns = np.diff([entry.stamp_ns for entry in entries])
-        period_ns = max(1, int(np.median(steps_ns))) if len(steps_ns) else _USUAL_PERIOD_NS
+        period_ns = median_period_ns([entry.stamp_ns for entry in entries])
         stamps_ns = [entry.stamp_ns for entry in columns_of_entry]
         layout = PointLayout.find([*columns_of_entry.values()], where, period_ns, stamps_ns)
         return Lidar(topic, frame, bool(placed_frame), entries, T, period_ns, layout)
@@ -449,7 +414,7 @@ class RosBag(FileSequence):
         if not self._index[topic]:
             raise InputError(f"{where}: holds no images")
         image = self._bag.message(topic, self._index[topic][0])
-        check_encoding(image, where)
+        ros_bag.check_encoding(image, where)
         frame, lidar = _plain(image.header.frame_id), self._lidars[0].frame
         T = self._transforms.between(frame, lidar)
         if T is None:
@@ -461,14 +426,14 @@ class RosBag(FileSequence):
         name = (namespace if namespaces.count(namespace) == 1 else topic).strip("/")
         rectified = "rect" in topic.removesuffix("/compressed").rpartition("/")[2]
         name = name.replace("/", "_") or "camera"
-        return camera_of(message, name, T, rectified, f"{self._bag.path}: {info}")
+        return ros_bag.camera_of(message, name, T, rectified, f"{self._bag.path}: {info}")
 
     def _check_size(self, camera: Camera, topic: str) -> None:
         """Raise InputError if the first image of a topic is not of the camera's size."""
         where, info = f"{self._bag.path}: {topic}", f"{_namespace(topic)}/camera_info"
         image = self._bag.message(topic, self._index[topic][0])
         is_raw = hasattr(image, "height")
-        size = (image.height, image.width) if is_raw else image_rgb(image, where).shape[:2]
+        size = (image.height, image.width) if is_raw else ros_bag.image_rgb(image, where).shape[:2]
         message = next(self._bag.messages(info))
         binning = max(message.binning_x, message.binning_y)
         if binning > 1 and size == (message.height, message.width):

@@ -90,15 +90,6 @@ class Topic(NamedTuple):
     num_messages: int
 
 
-class Recorded(NamedTuple):
-    """A message as recorded."""
-
-    topic: str
-    log_ns: int  # time of recording
-    raw: bytes
-    type: str  # message type in ROS 2 notation
-
-
 class Bag:
     """A ROS 1 or ROS 2 bag, opened for reading; raises InputError if it is missing or damaged."""
 
@@ -136,8 +127,9 @@ class Bag:
         """
         entries_of_topic: dict[str, list[Entry]] = {topic: [] for topic in topics}
         num_recorded_at = Counter[tuple[str, int]]()
-        indexed: set[tuple[str, int, int]] = set()
-        for topic, log_ns, raw, _ in self._messages(topics) if topics else ():
+        indexed = set[tuple[str, int, int]]()
+        for connection, log_ns, raw in self._messages(topics):
+            topic = connection.topic
             turn = num_recorded_at[topic, log_ns]
             num_recorded_at[topic, log_ns] += 1
             try:
@@ -157,17 +149,17 @@ class Bag:
         recorded = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
         if len(recorded) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
-        return self._decoded(recorded[entry.turn])
+        return self._decoded(*recorded[entry.turn])
 
     def messages(self, topic: str) -> Iterator[Any]:
         """Yield all decoded messages of a topic in the order of recording."""
         for recorded in self._messages([topic]):
-            yield self._decoded(recorded)
+            yield self._decoded(*recorded)
 
     def _messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterator[Recorded]:
-        """Yield messages by recording time."""
+    ) -> Iterator[tuple[Any, int, bytes]]:
+        """Yield rosbags' connection, recording time (ns) and raw bytes of messages, by the time."""
         streams = []
         for reader in self._readers:
             connections = [c for c in reader.connections if c.topic in topics]
@@ -175,20 +167,18 @@ class Bag:
                 streams.append(reader.messages(connections, start_ns, stop_ns))
         with self._lock:
             try:
-                for connection, log_ns, raw in heapq.merge(*streams, key=lambda record: record[1]):
-                    yield Recorded(connection.topic, log_ns, raw, connection.msgtype)
+                yield from heapq.merge(*streams, key=lambda record: record[1])
             except Exception as error:  # the parser may raise any type
                 raise self._unreadable(error) from error
 
-    def _decoded(self, recorded: Recorded) -> Any:
-        topic, _, raw, type_ = recorded
+    def _decoded(self, connection: Any, log_ns: int, raw: bytes) -> Any:
         decode = self._types.deserialize_cdr if self._is_ros2 else self._types.deserialize_ros1
         try:
-            return decode(raw, type_)
+            return decode(raw, connection.msgtype)
         except Exception as error:  # the parser may raise any type
             raise InputError(
-                f"{self.path}: {topic}: a message of {len(raw)} bytes is no whole {type_} "
-                f"({reason(error)})"
+                f"{self.path}: {connection.topic}: a message of {len(raw)} bytes is no whole "
+                f"{connection.msgtype} ({reason(error)})"
             ) from error
 
     def _unreadable(self, error: Exception) -> InputError:
@@ -252,7 +242,7 @@ def _bag_files(path: Path) -> list[Path]:
             f"or decompress it by zstd -d {packed[0].name} and name {packed[0].stem}"
         )
     for suffix in suffixes:
-        files = sorted(path.glob(f"*{suffix}")) if path.is_dir() else []
+        files = sorted(path.glob(f"*{suffix}"))
         if files and (suffix == ".bag" or len(files) == 1):
             return files
         if files:
@@ -284,9 +274,10 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
         table = np.array(rows, list(_LIVOX.items()))
         return {name: table[name] for name in _LIVOX}
     order = ">" if message.is_bigendian else "<"
-    layout: dict[str, tuple[str, int]] = {}  # type and byte offset of each field
+    formats: dict[str, str] = {}
+    offsets: list[int] = []
     for entry in message.fields:
-        if entry.count > 1 or not entry.name or entry.name in layout:
+        if entry.count > 1 or not entry.name or entry.name in formats:
             continue
         kind = _DATATYPES.get(entry.datatype)
         if kind is None or entry.offset + int(kind[1]) > message.point_step:
@@ -294,15 +285,14 @@ def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
                 f"{where}: field {entry.name}: got type {entry.datatype} at byte {entry.offset} of "
                 f"{message.point_step}, expected one of ROS's eight types inside the point"
             )
-        layout[entry.name] = (order + kind, entry.offset)
-    formats = [kind for kind, _ in layout.values()]
-    offsets = [offset for _, offset in layout.values()]
-    spec: Any = {"names": [*layout], "formats": formats, "offsets": offsets}
+        formats[entry.name] = order + kind
+        offsets.append(entry.offset)
+    layout: Any = {"names": [*formats], "formats": [*formats.values()], "offsets": offsets}
     # Some drivers leave the step of an only row at zero.
     step = message.row_step or message.width * message.point_step * (message.height == 1)
     points_of_rows = _rows(message, step, message.point_step, where)
-    points = points_of_rows.reshape(-1).view(np.dtype(spec | {"itemsize": message.point_step}))
-    return {name: points[name] for name in layout}
+    points = points_of_rows.reshape(-1).view(np.dtype(layout | {"itemsize": message.point_step}))
+    return {name: points[name] for name in formats}
 
 
 def _rows(message: Any, step: int, item_bytes: int, where: str) -> NDArray[np.uint8]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
@@ -55,11 +55,9 @@ def date_ns(text: str) -> int:
 def _epoch_unit(text: str) -> str:
     """Return the unit in which a number is a time from 2000 to 2099, "" if no unit fits."""
     for unit in UNIT_NS:
-        try:
+        with suppress(ValueError):
             if _EPOCH_NS[0] <= _to_ns(text, unit) < _EPOCH_NS[1]:
                 return unit
-        except ValueError:
-            continue
     return ""
 
 
@@ -77,25 +75,25 @@ class TextTable(NamedTuple):
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
         """Return the table of a file; the first line has names if one is known or if it has a #."""
-        table = TextTable(path, [], [], [])
+        names, lines, rows = list[str](), list[int](), list[list[str]]()
         for number, line in enumerate(read_text(path).splitlines(), 1):
             text = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", line.strip().strip("#,;").strip())
             words = [word.strip('"') for word in re.split(r"[\s,;]+", text)]
             lower = [word.lower().split("[")[0] for word in words]
             is_comment = line.lstrip().startswith("#")
-            if not table.rows and not table.names and (is_comment or {*lower} & {*known}):
-                table.names.extend(lower)
+            if not rows and not names and (is_comment or {*lower} & {*known}):
+                names = lower
             elif text and not is_comment:
-                table.lines.append(number)
-                table.rows.append(words)
-                if len(words) < len(table.rows[0]):
+                lines.append(number)
+                rows.append(words)
+                if len(words) < len(rows[0]):
                     raise InputError(
                         f"{path}: line {number}: got {len(words)} columns, expected "
-                        f"{len(table.rows[0])} as in the lines before; it may be cut off"
+                        f"{len(rows[0])} as in the lines before; it may be cut off"
                     )
-        if not table.rows:
+        if not rows:
             raise InputError(f"{path}: holds no lines with numbers")
-        return table
+        return TextTable(path, names, lines, rows)
 
     def column(self, choices: Collection[str]) -> int | None:
         """Return the index of the first column among the names ``choices``, None without any."""
@@ -161,7 +159,7 @@ class StampFile(NamedTuple):
             are_files = [Path(word).suffix[1:2].isalpha() for word in words]
             name_column = are_files.index(True) if any(are_files) else None
         if time_column is None:
-            time_column = next((column for column in range(len(words)) if column != name_column), 0)
+            time_column = 1 if name_column == 0 and len(words) > 1 else 0
         stamps_ns, unit = table.times_ns(time_column, unit)
         if name_column is None:
             table.check_digits(stamps_ns, time_column)
@@ -212,10 +210,9 @@ class NamedFile(NamedTuple):
         # 1317042651468 are times since 1970.
         words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
         if unit:
-            try:
+            with suppress(ValueError):
                 return NamedFile(path, None, _to_ns(words[-1] if words else "", unit))
-            except ValueError:
-                return NamedFile(path, None, None)
+            return NamedFile(path, None, None)
         for word in reversed(words):
             epoch = _epoch_unit(word)
             # Ten digits without a fraction are a frame number, as in KITTI's file names.
@@ -225,8 +222,7 @@ class NamedFile(NamedTuple):
         return NamedFile(path, int(digits[-1]) if digits else None, None)
 
 
-@dataclass(frozen=True)
-class Series:
+class Series(NamedTuple):
     """Files of sweeps or images in the order of time."""
 
     paths: Mapping[int, Path]  # path of each file, by its number
@@ -256,9 +252,8 @@ def order_files(
             f"{untimed[0]}: its name is no time; expected such as 1317042651.468569638, or a "
             f"stamps_unit beside stamps: names in densify.yaml"
         )
-    file = None
-    if stamps not in ("names", "sweeps"):
-        file = _stamp_file(root, paths[0].parent, stamps, shared)
+    is_beside = stamps not in ("names", "sweeps")
+    file = _stamp_file(root, paths[0].parent, stamps, shared) if is_beside else None
     named_of = _numbered(names)
     path_of = {number: name.path for number, name in named_of.items()}
     if file is not None:
@@ -321,10 +316,8 @@ def files_below(root: Path, suffixes: Sequence[str], depth: int) -> dict[str, li
         relative = Path(folder).relative_to(root)
         if len(relative.parts) == depth:
             subfolders.clear()
-        visible = [Path(folder, name) for name in sorted(names) if name[0] != "."]
-        paths = [
-            path for path in visible if path.suffix.lower() in suffixes and os.path.isfile(path)
-        ]
+        paths = [Path(folder, name) for name in sorted(names) if name[0] != "."]
+        paths = [path for path in paths if path.suffix.lower() in suffixes and os.path.isfile(path)]
         if paths:
             files_of_folder[relative.as_posix()] = paths
     return files_of_folder

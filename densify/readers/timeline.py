@@ -18,7 +18,11 @@ from densify.geometry.types import Camera, Int, LidarSequence, Sweep, Trajectory
 
 _HOLE_PERIODS = 3.1  # a longer step is a hole in time: 3 periods and some jitter
 _MOST_RANGES = 8
-_NOMINAL_PERIOD_NS = 100_000_000  # period of a recording with one sweep
+
+
+def median_period_ns(stamps_ns: Sequence[int] | Int, default_ns: int = 100_000_000) -> int:
+    """Return the median time (ns) between consecutive stamps, the default for a single stamp."""
+    return max(1, int(np.median(np.diff(stamps_ns)))) if len(stamps_ns) > 1 else default_ns
 
 
 class WindowFrames(NamedTuple):
@@ -42,9 +46,8 @@ def to_runs(frames: Iterable[int]) -> list[range]:
 
 def format_frames(frames: Iterable[int]) -> str:
     """Return frame numbers as ascending text, such as ``96-135, 140``, shortened to 8 ranges."""
-    texts = [
-        f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in to_runs(sorted(frames))
-    ]
+    runs = to_runs(sorted(frames))
+    texts = [f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs]
     if len(texts) > _MOST_RANGES:
         texts = [*texts[: _MOST_RANGES - 1], "...", texts[-1]]
     return ", ".join(texts) if texts else "none"
@@ -53,10 +56,8 @@ def format_frames(frames: Iterable[int]) -> str:
 def check_window(window: int) -> None:
     """Raise InputError unless the window is a whole number of sweeps, 0 or more."""
     if isinstance(window, bool) or not isinstance(window, int | np.integer) or window < 0:
-        raise InputError(
-            f"window {window!r}: expected a whole number of sweeps on each side of the key, 0 or "
-            f"more"
-        )
+        expected = "a whole number of sweeps on each side of the key, 0 or more"
+        raise InputError(f"window {window!r}: expected {expected}")
 
 
 def check_key(key: int) -> None:
@@ -107,9 +108,7 @@ class Timeline:
     @cached_property
     def period_ns(self) -> int:
         """Median time between consecutive sweeps in nanoseconds; 100 ms for a single sweep."""
-        if len(self.frames) < 2:
-            return _NOMINAL_PERIOD_NS
-        return max(1, int(np.median(np.diff(self.stamp_ns))))
+        return median_period_ns(self.stamp_ns)
 
     def num_in(self, duration_s: float) -> int:
         """Return the number of sweeps in a duration in seconds at the median rate, rounded."""
