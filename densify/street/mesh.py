@@ -105,10 +105,6 @@ class Mesh:
             instance=np.full(2 * num, -1, np.int32),
         )
 
-    def moved(self, offset: Point) -> Mesh:
-        """Return the mesh moved by a (3,) offset in metres."""
-        return replace(self, vertices=self.vertices + offset)
-
     def posed(self, T_a_mesh: Float) -> Mesh:
         """Return the mesh in frame a, where ``T_a_mesh`` (4,4) is the pose of its present frame."""
         return replace(self, vertices=self.vertices @ T_a_mesh[:3, :3].T + T_a_mesh[:3, 3])
