@@ -51,7 +51,7 @@ def test_static_points_have_exactly_no_flow_and_movers_that_of_their_body(street
         body = world.bodies[returns.body[row]].trajectory
 
         def T_world_body(time_ns, body=body):
-            return body.poses(np.array([seconds(time_ns)])).matrix()
+            return body.poses(np.array([seconds(time_ns)])).matrices()[0]
 
         fired = street.stamp_ns(KEY) + int(returns.offset_ns[row])
         p_lidar = np.append(returns.points[row].astype(float), 1.0)
@@ -181,7 +181,7 @@ def test_leaves_let_their_share_of_rays_through_and_glass_light():
 
 
 def _vertices_at(body: Body, time_s: float) -> np.ndarray:
-    return transform(body.trajectory.poses(np.array([time_s])).matrix(), body.mesh.vertices)
+    return transform(body.trajectory.poses(np.array([time_s])).matrices()[0], body.mesh.vertices)
 
 
 _LATTICE = np.stack(np.meshgrid(*[np.linspace(0, 1, k) for k in (9, 5, 3)]), -1).reshape(-1, 3)
@@ -197,7 +197,7 @@ def _check_no_contact(scene: Scene) -> None:
     sideways = np.stack([-standing.forward[:, 1], standing.forward[:, 0]], axis=1)
     axes = np.stack([standing.forward, sideways], axis=1)
     for time in np.arange(0.0, 16.0, 0.4):
-        matrices = [b.trajectory.poses(np.array([time])).matrix() for b in boxes]
+        matrices = [b.trajectory.poses(np.array([time])).matrices()[0] for b in boxes]
         clouds = [
             transform(T, low + _LATTICE * (high - low))
             for T, (low, high) in zip(matrices, bounds, strict=True)

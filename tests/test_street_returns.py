@@ -63,7 +63,7 @@ def car_park(seed: int) -> tuple[World, Int]:
             paint = (PAINTS[brightness[-1]][int(rng.integers(2))],) * 3
             car = car_mesh(paint, rng).of_instance(len(meshes))
             place = away_m * np.cos(angle), away_m * np.sin(angle), 0.0
-            meshes.append(car.posed(upright(place, rng.uniform(0, 2 * np.pi)).matrix()))
+            meshes.append(car.posed(upright(place, rng.uniform(0, 2 * np.pi)).matrices()[0]))
     room = box((-45, -45, 0), (45, 45, 14), Material.BRICK)
     return World([Body(Mesh.join([room, *meshes]), Still())]), np.array(brightness)
 

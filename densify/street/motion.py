@@ -192,11 +192,11 @@ class Poses(NamedTuple):
         """Return the poses at these indices."""
         return Poses(self.rotation[rows], self.position[rows])
 
-    def matrix(self, row: int = 0) -> Float:
-        """Return the (4,4) matrix ``T_world_body`` of one pose."""
-        T_world_body = np.eye(4)
-        T_world_body[:3, :3] = self.rotation[row]
-        T_world_body[:3, 3] = self.position[row]
+    def matrices(self) -> Float:
+        """Return the (N,4,4) matrices ``T_world_body``."""
+        T_world_body = np.tile(np.eye(4), (len(self.position), 1, 1))
+        T_world_body[:, :3, :3] = self.rotation
+        T_world_body[:, :3, 3] = self.position
         return T_world_body
 
 

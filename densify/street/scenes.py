@@ -210,7 +210,7 @@ class Scenery:
 
     def _stand(self, mesh: Mesh, pose: motion.Poses, solid: Mesh) -> None:
         """Add a mesh at its pose, and the footprint of its solid part."""
-        self.meshes.append(mesh.posed(pose.matrix()))
+        self.meshes.append(mesh.posed(pose.matrices()[0]))
         self.footprints.append(Rectangles.of(solid, pose))
 
     def _is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:

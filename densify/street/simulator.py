@@ -51,9 +51,8 @@ class Bodies:
         """Return the truth of a sweep's points, as in `place`, of the objects ``instance`` (N,)."""
         T_world_lidar = self.T_world_lidar[frame]
         from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
-        return SweepTruth(
-            T_world_lidar, from_lidar @ T_world_lidar[:3, :3], instance, self.moving[frame][body]
-        )
+        points_lidar = from_lidar @ T_world_lidar[:3, :3]
+        return SweepTruth(T_world_lidar, points_lidar, instance, self.moving[frame][body])
 
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
@@ -136,7 +135,7 @@ class Simulator:
 
     def T_world_lidar_at(self, time_ns: int) -> Float:
         """Return the (4,4) pose of the lidar frame in the world at a time in ns since 1970."""
-        T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrix()
+        T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrices()[0]
         return T_world_ego @ T_ego_lidar(self.tilt_deg)
 
     @cached_property
@@ -153,16 +152,9 @@ class Simulator:
         bodies = self.scene.world.bodies
         if indices is not None:
             bodies = tuple(bodies[index] for index in indices)
-        T_world_body = np.tile(np.eye(4), (len(times), len(bodies), 1, 1))
-        for index, body in enumerate(bodies):
-            poses = body.trajectory.poses(times)
-            T_world_body[:, index, :3, :3] = poses.rotation
-            T_world_body[:, index, :3, 3] = poses.position
-        return Bodies(
-            np.stack([self.T_world_lidar_at(stamp) for stamp in stamps_ns]),
-            T_world_body,
-            _moving(bodies, times),
-        )
+        T_world_lidar = np.stack([self.T_world_lidar_at(stamp) for stamp in stamps_ns])
+        T_world_body = np.stack([body.trajectory.poses(times).matrices() for body in bodies], axis=1)
+        return Bodies(T_world_lidar, T_world_body, _moving(bodies, times))
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
         """Return the (N,3) measured points, each in the frame of the body that the ray hit."""
