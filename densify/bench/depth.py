@@ -9,7 +9,7 @@ and within 80 m. ``key held out``: returns of the key sweep, for a map made from
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product as cartesian
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -225,7 +225,7 @@ def bench_depth(
             and the filled map; ``seconds`` of projection per key sweep; ``scores`` (num_pixels,
             coverage, outliers) by ground truth, map (measured, filled) and pixels (all, moving).
     """
-    choose_cameras(sequence, cameras)
+    chosen = choose_cameras(sequence, cameras)
     if method not in METHODS:
         raise InputError(f"--method {method}: expected one of {', '.join(METHODS)}")
     if scanner is not None and not np.any(sequence[keys[0]].lidar == scanner):
@@ -234,7 +234,7 @@ def bench_depth(
     sums = {name: _Sums() for name in variants}
     for number, key in enumerate(keys):
         for name, config in variants.items():
-            shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
+            shots = key_shots(sequence, chosen, key, config.project)
             truths = {}
             if scanner is not None:
                 whole = Recording(sequence, config, window, [key], looks_around=True)
@@ -258,7 +258,7 @@ class _Sums:
     def __init__(self) -> None:
         # Pixels with a true depth, those that have a depth in the map too, outliers among these
         self._counts: defaultdict[tuple[str, str, str], Any] = defaultdict(lambda: np.zeros(3, int))
-        self._densities: dict[str, list[float]] = {product: [] for product in PRODUCTS}
+        self._densities: defaultdict[str, list[float]] = defaultdict(list)
         self._seconds = 0.0
 
     def add(
@@ -274,7 +274,12 @@ class _Sums:
             for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
                 self._densities[product].append(image_density(depth_m))
                 for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
-                    for group, counts in _counted(depth_m, truth, focal_px):
+                    has_truth = truth.depth_m > 0
+                    groups = {"all": has_truth, "moving": has_truth & truth.moving}
+                    for group, known in groups.items():
+                        compared = known & (depth_m > 0)
+                        outliers = truth.outliers(depth_m, compared, focal_px)
+                        counts = (known.sum(), compared.sum(), outliers.sum())
                         self._counts[source, product, group] += counts
         for scores in (result.metrics.get("held_out") or {}).values():
             for product, group in cartesian(PRODUCTS, _GROUPS):
@@ -286,24 +291,12 @@ class _Sums:
     def numbers(self, num_keys: int) -> dict[str, Any]:
         """Return density, seconds and scores of a variant, see `bench_depth`."""
         scores: dict[str, Any] = {}
-        for (source, product, group), (num, compared, outliers) in self._counts.items():
+        for (source, product, group), counts in self._counts.items():
+            num, compared, outliers = counts.tolist()
             scores.setdefault(source, {}).setdefault(product, {})[group] = {
-                "num_pixels": int(num),
+                "num_pixels": num,
                 "coverage": compared / num if num else None,
                 "outliers": outliers / compared if compared else None,
             }
-        density = {
-            product: float(np.mean(shares)) for product, shares in self._densities.items() if shares
-        }
+        density = {product: float(np.mean(shares)) for product, shares in self._densities.items()}
         return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}
-
-
-def _counted(
-    depth_m: Float32, truth: TruthMap, focal_px: float
-) -> Iterator[tuple[str, tuple[int, int, int]]]:
-    """Yield "all" and "moving" pixels, each with its three counts of `_Sums`."""
-    for group in _GROUPS:
-        known = (truth.depth_m > 0) & (truth.moving if group == "moving" else True)
-        compared = known & (depth_m > 0)
-        outliers = truth.outliers(depth_m, compared, focal_px)
-        yield group, (int(known.sum()), int(compared.sum()), int(outliers.sum()))

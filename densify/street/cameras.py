@@ -64,10 +64,12 @@ def _pinhole(name: str, row: Any) -> Camera:
 
 
 CAMERAS = {name: _pinhole(name, row) for name, row in vars(_TABLES.pinhole).items()}
+_WIDTH_PX, _HEIGHT_PX = _FISHEYE.size_px
 CAMERAS["fisheye"] = Camera(
     "fisheye",
-    *_FISHEYE.size_px,
-    _intrinsics(_FISHEYE.focal_px, *((size - 1) / 2 for size in _FISHEYE.size_px)),
+    _WIDTH_PX,
+    _HEIGHT_PX,
+    _intrinsics(_FISHEYE.focal_px, (_WIDTH_PX - 1) / 2, (_HEIGHT_PX - 1) / 2),
     _pose(_LEFT, _FISHEYE.lidar_m),
     tuple(_FISHEYE.distortion),
     model="fisheye",

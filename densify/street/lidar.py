@@ -419,9 +419,7 @@ def _spot(direction: Float) -> Float:
     return np.stack([direction, *(ray / lengths(ray) for ray in rays)], axis=1)
 
 
-def _strongest_echoes(
-    hits: Hits, spot: Float, rng: np.random.Generator
-) -> tuple[Float, Int, Bool]:
+def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Int, Bool]:
     """Return the strongest echo of each laser spot, from the hits of its (N,5,3) rays.
 
     It is (N,) ranges, inf without a hit; (N,) indices of the rays whose surface counts; and a mask

@@ -60,8 +60,8 @@ def _solid(row: Any, parameters: dict[str, Any]) -> Mesh:
     make, offsets = _SOLIDS[fields.pop("solid")], fields.pop("at", None)
     if "spaced" in fields:
         spaced = fields.pop("spaced")
-        ends = (resolve(end, parameters) for end in (spaced.first, spaced.end))
-        steps = np.arange(*ends, spaced.step_m)
+        first, end = (resolve(end, parameters) for end in (spaced.first, spaced.end))
+        steps = np.arange(first, end, spaced.step_m)
         gap_m = resolve(getattr(spaced, "from_middle_m", 0.0), parameters)
         axis = np.eye(3)["xyz".index(spaced.axis)]
         offsets = steps[np.abs(steps) >= gap_m, None] * axis

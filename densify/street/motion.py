@@ -96,7 +96,8 @@ class Lane:
 def polyline(corners: Sequence[Sequence[float] | Float], radius_m: float) -> Float:
     """Return (N,2) points, half a metre apart, along lines with corners rounded to ``radius_m``."""
     points = np.asarray(corners, float)
-    arcs = [_rounded_corner(*points[i : i + 3], radius_m) for i in range(len(points) - 2)]
+    corner_lines = zip(points[:-2], points[1:-1], points[2:], strict=True)
+    arcs = [_rounded_corner(a, b, c, radius_m) for a, b, c in corner_lines]
     xy = np.concatenate([points[:1], *arcs, points[-1:]])
     # Resample the points at equal steps.
     length_m = _lengths_along(xy)

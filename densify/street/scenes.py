@@ -6,7 +6,7 @@ Time 0 is frame 0. The actors are around the ego vehicle at the meeting time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any

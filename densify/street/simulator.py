@@ -153,8 +153,8 @@ class Simulator:
         if indices is not None:
             bodies = tuple(bodies[index] for index in indices)
         T_world_lidar = np.stack([self.T_world_lidar_at(stamp) for stamp in stamps_ns])
-        T_world_body = np.stack([body.trajectory.poses(times).matrices() for body in bodies], axis=1)
-        return Bodies(T_world_lidar, T_world_body, _moving(bodies, times))
+        T_by_body = [body.trajectory.poses(times).matrices() for body in bodies]
+        return Bodies(T_world_lidar, np.stack(T_by_body, axis=1), _moving(bodies, times))
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
         """Return the (N,3) measured points, each in the frame of the body that the ray hit."""
