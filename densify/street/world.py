@@ -156,8 +156,8 @@ class World:
             nearer = np.flatnonzero(hits.range_m < best.range_m[rows])
             hit_poses = body_poses.rows(nearer // num_together)
             hits.normal[nearer] = hit_poses.turn(hits.normal[nearer])
-            for all_hits, body_hits in zip(best, hits, strict=True):
-                all_hits[rows[nearer]] = body_hits[nearer]
+            for name in Hits._fields:
+                getattr(best, name)[rows[nearer]] = getattr(hits, name)[nearer]
         best.range_m[best.absorbed] = np.inf
         return best
 
