@@ -9,14 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.bench.paper import (
-    METHODS,
-    bench_paper,
-    has_truth,
-    pair_of_recording,
-    pairs_of_files,
-    read_pair,
-)
+from densify.bench import paper
+from densify.bench.paper import METHODS, bench_paper, pair_of_recording, pairs_of_files, read_pair
 from densify.config.errors import InputError
 from densify.learning.network import Model, build, write_model
 from densify.readers.street import Street
@@ -96,7 +90,7 @@ def test_without_truth_networks_are_held_against_the_engine(tmp_path: Path) -> N
     street = Street("street", 5, "vlp16", cameras=())
     log = write_street("argoverse2", street, tmp_path / "log", range(58, 61))
     bare = shutil.copytree(log, tmp_path / "bare", ignore=shutil.ignore_patterns("truth"))
-    assert has_truth(str(log)) and not has_truth(str(bare))
+    assert paper.has_truth(str(log)) and not paper.has_truth(str(bare))
     exact, estimated = (pair_of_recording(str(path), 1) for path in (log, bare))
     assert exact.moving.any() and not exact.flow[~exact.moving].any() and len(exact.sweeps) == 5
     assert exact.source.shape == exact.flow.shape == tuple(exact.sweeps[0].points.shape)

@@ -3,22 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import namedtuple
 
 import numpy as np
 import pytest
 
 from densify.geometry.types import Float, Int
 from densify.street.cameras import CAMERAS, expose
-from densify.street.lidar import (
-    LIDAR_HEIGHT_M,
-    Mount,
-    Scanner,
-    Sensor,
-    Spinning,
-    firings,
-    scan,
-)
+from densify.street.lidar import LIDAR_HEIGHT_M, Mount, Scanner, Sensor, Spinning, firings, scan
 from densify.street.mesh import Material, Mesh, box
 from densify.street.models import car_mesh
 from densify.street.motion import Curve, Driving, Speed, Still, Terrain, upright
@@ -68,16 +60,9 @@ def car_park(seed: int) -> tuple[World, Int]:
     return World([Body(Mesh.join([room, *meshes]), Still())]), np.array(brightness)
 
 
-@dataclass
-class OnCars:
-    """The N rays that should meet a car. pulse, car: (N,). part: (N,) 0 lower half, 1 window band,
-    -1 neither. bin: (N,) of incidence. range_m: (N,) to the surface."""
-
-    pulse: Int
-    car: Int
-    part: Int
-    bin: Int
-    range_m: Float
+# The N rays that should meet a car. pulse, car: (N,). part: (N,) 0 lower half, 1 window band,
+# -1 neither. bin: (N,) of incidence. range_m: (N,) to the surface.
+OnCars = namedtuple("OnCars", "pulse car part bin range_m")
 
 
 def rays_on_cars(world: World) -> OnCars:

@@ -19,7 +19,7 @@ from scipy.special import ndtr, ndtri
 from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street import read_table
-from densify.street.mesh import REFLECTIVITY, Material, across, lengths, noise
+from densify.street.mesh import REFLECTIVITY, Material, lengths, noise
 from densify.street.motion import Driving, poses_at
 from densify.street.world import ABSORBED, PASSES, STOPS, Hits, Meeting, Optics, Rays, World
 
@@ -414,7 +414,7 @@ def _spot(direction: Float) -> Float:
     """Return (N,5,3) ray directions of N beams: spot centre, then four around it."""
     left = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
     left /= lengths(left)
-    upward = across(direction, left)
+    upward = np.cross(direction, left)
     rays = [direction + _SPOT_RAD * (a * left + b * upward) for a, b in _SPOT[1:]]
     return np.stack([direction, *(ray / lengths(ray) for ray in rays)], axis=1)
 

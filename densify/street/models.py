@@ -18,13 +18,12 @@ import numpy as np
 from densify.geometry.types import Float
 from densify.street import read_table
 from densify.street.mesh import WHITE, Material, Mesh, Tint, ball, box, frustum, leaves, tube
-from densify.street.motion import DURATION_S, Driving, Limb, Towed
+from densify.street.motion import Driving, Limb, Towed
 from densify.street.world import Body
 
 _SHAPES = read_table("models")
 _MIRROR = np.array([1.0, -1.0, 1.0])
 WHEELBASE_M: dict[str, float] = vars(_SHAPES.wheelbase_m)
-SPAN_S = (-1.0, DURATION_S + 1.0)  # times with poses
 _CACHED_MODELS = 32
 
 
@@ -157,7 +156,7 @@ def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a 16 m articulated truck whose trailer follows the tractor through turns."""
     cab = model("truck_cab", paint=random_paint(rng))
     load = model("truck_load", tarpaulin=_random_cloth(rng))
-    towed = Towed(motion, _SHAPES.truck.kingpin_m, WHEELBASE_M["trailer"], *SPAN_S)
+    towed = Towed(motion, _SHAPES.truck.kingpin_m, WHEELBASE_M["trailer"])
     return Actor("truck", (Body(cab, motion, instance), Body(load, towed, instance)), num_solid=2)
 
 

@@ -12,9 +12,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from densify.geometry.types import Bool, Float, Int
-from densify.street.mesh import Mesh, across, lengths
+from densify.street.mesh import Mesh, lengths
 
 DURATION_S = 16  # duration of every scene
+SPAN_S = (-1.0, DURATION_S + 1.0)  # times with poses
 STEP_M = 0.5  # distance between the points of a curve
 _FINE_M = 0.05  # step of the integration of a curve
 _TOW_S = 0.01  # time between the computed positions of a trailer
@@ -278,28 +279,21 @@ def on_ground(
     forward = (front_xyz - rear_xyz) * (1.0, 1.0, not upright)
     # The axis to the left is perpendicular to the direction of travel and to the ground's normal.
     x = forward / lengths(forward)
-    y = across(np.column_stack([-slope, np.ones(len(slope))]), x)
+    y = np.cross(np.column_stack([-slope, np.ones(len(slope))]), x)
     y /= lengths(y)
-    return Poses(np.stack([x, y, across(x, y)], axis=2), middle)
+    return Poses(np.stack([x, y, np.cross(x, y)], axis=2), middle)
 
 
 class Towed:
     """The trajectory of a trailer, whose axle follows the tractor's kingpin (a tractrix)."""
 
-    def __init__(
-        self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
-    ) -> None:
-        """Compute the path of the axle.
+    def __init__(self, tractor: Driving, kingpin_m: float, wheelbase_m: float) -> None:
+        """Compute the path of the trailer's axle, ``wheelbase_m`` behind the kingpin.
 
-        Args:
-            tractor: Motion of the tractor.
-            kingpin_m: Position of the kingpin on the x axis of the tractor.
-            wheelbase_m: Distance from the kingpin to the axle of the trailer.
-            first_s: Begin of the computed path, in seconds since frame 0.
-            last_s: End of the path.
+        ``kingpin_m`` is the position of the kingpin on the x axis of the tractor.
         """
         self._tractor, self._kingpin_m = tractor, kingpin_m
-        times = np.arange(first_s, last_s, _TOW_S)
+        times = np.arange(*SPAN_S, _TOW_S)
         pin = self._pin(times)
         axle = np.empty_like(pin)
         # The trailer starts straight behind the tractor. In each step the axle keeps its distance.

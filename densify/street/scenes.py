@@ -17,8 +17,8 @@ from densify.geometry.types import Float
 from densify.street import models, motion, read_table
 from densify.street.ground import Ground, Road, Side, mark_road
 from densify.street.mesh import Material, Mesh
-from densify.street.models import SPAN_S, WHEELBASE_M, Actor, model, panel, resolve
-from densify.street.motion import Curve, Driving, Lane, Rectangles, Speed, left_of, upright
+from densify.street.models import WHEELBASE_M, Actor, model, panel, resolve
+from densify.street.motion import SPAN_S, Curve, Driving, Lane, Rectangles, Speed, left_of, upright
 from densify.street.world import Body, World
 
 _TABLES = read_table("scenes")
@@ -142,9 +142,7 @@ def _turn(table: Any, main: Curve, side: Curve) -> tuple[Curve, float]:
     return curve, curve.length_m - straight_m - arc_m
 
 
-def _lay_crossing(
-    table: Any, rng: np.random.Generator
-) -> tuple[dict[str, Curve], dict[str, float]]:
+def _lay_crossing(table: Any, _: object) -> tuple[dict[str, Curve], dict[str, float]]:
     """Return the curves of the crossroads (straight roads and turning paths), and the stations."""
     curves = {
         name: Curve(motion.polyline(path.corners, getattr(path, "radius_m", 0.0)))
@@ -403,13 +401,7 @@ class Traffic:
     def __init__(
         self, ego: Driving, scenery: Scenery, lanes: Mapping[str, Any], curves: Mapping[str, Curve]
     ) -> None:
-        """Start without actors.
-
-        Args:
-            scenery: Static objects, which actors must not touch.
-            lanes: Rows of ``lanes`` in scenes.yaml, by name.
-            curves: Curves of the roads, by name.
-        """
+        """Start without actors; ``lanes`` are rows of scenes.yaml and ``curves`` roads, by name."""
         self.actors: list[Actor] = []
         self._ground, self._rng = scenery.ground, scenery.rng
         self._lanes, self._curves = lanes, curves

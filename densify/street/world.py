@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.geometry.types import Bool, Float, Float32, Int
-from densify.street.mesh import Mesh, across, lengths
+from densify.street.mesh import Mesh, lengths
 from densify.street.motion import Trajectory, poses_at
 
 _STEP_M = 2e-3  # distance from a surface that a ray passes to its next origin
@@ -85,7 +85,7 @@ class Triangles:
         # Embree computes in single precision; the planes are those of its rounded corners.
         single = mesh.vertices.astype(np.float32)[mesh.triangles]
         corners = single.astype(np.float64)
-        normal = across(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = lengths(normal)
         keep = np.flatnonzero(length[:, 0] > _FLAT_M2)
         counts = [len(body_mesh.triangles) for body_mesh in meshes]
