@@ -35,12 +35,9 @@ _S_PER_NS = 1e-9
 class Spinning:
     """A pattern that spins once a sweep, clockwise from above, forward at the reference time."""
 
-    # Elevations of the beams in firing order. Beams fire one after another, so every pulse has its
-    # own azimuth.
+    # Elevations of the beams, which fire one after another: every pulse has its own azimuth.
     elevation_deg: tuple[float, ...]
-    # Firings per second of each beam. A revolution at 20 Hz has half the columns of a revolution at
-    # 10 Hz.
-    columns_per_s: int
+    columns_per_s: int  # firings per second of each beam, at any rate of revolutions
     phase: float = 0.0  # lead in turns over a scanner that faces forward at the reference time
 
     def num_pulses(self, period_s: float) -> int:
@@ -75,7 +72,6 @@ class _Steady:
 class Raster(_Steady):
     """A scan pattern that covers a rectangle, line by line, by a fast and a slow mirror."""
 
-    # No two pulses of a sweep have the same elevation.
     width_deg: float  # width of the field of view, with its centre straight ahead
     height_deg: float  # height of the field of view
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
@@ -93,16 +89,14 @@ class Rosette(_Steady):
     """A scan pattern of two equal prisms: a rose that never repeats, as in Livox's scanners."""
 
     width_deg: float  # diameter of the round field of view
-    # Rotation rates of the two prisms. Petals are drawn at the difference of the rates and turn at
-    # their sum.
+    # Rates of the two prisms. Petals are drawn at their difference and turn at their sum.
     turns_per_s: tuple[float, float]
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
         """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
         first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
         axis_angle = np.radians(self.width_deg / 2) * np.cos(first - second)
-        roll = first + second
-        sine = np.sin(axis_angle)
+        roll, sine = first + second, np.sin(axis_angle)
         return np.stack([np.cos(axis_angle), sine * np.cos(roll), sine * np.sin(roll)], axis=1)
 
 
@@ -283,16 +277,11 @@ def patches(position: Float, owner: Int) -> Float:
     share = position / _PATCH_M - cell
     share = share * share * (3 - 2 * share)  # smoothstep: slope 0 at the sides of a cell
     i, j, k = cell.astype(np.int64).T
-    xo_key = i + _LARGE_PRIME * owner
-    yz_key = j + _LARGE_PRIME * k
-    hashed = noise(xo_key, yz_key)
-    # The corners of each cell are drawn once.
-    _, first, cell_of = np.unique(hashed, return_index=True, return_inverse=True)
+    xo_key, yz_key = i + _LARGE_PRIME * owner, j + _LARGE_PRIME * k
     corners = [
-        noise(xo_key[first] + x, yz_key[first] + y + _LARGE_PRIME * z)
-        for x, y, z in product((0, 1), repeat=3)
+        noise(xo_key + x, yz_key + y + _LARGE_PRIME * z) for x, y, z in product((0, 1), repeat=3)
     ]
-    normal = ndtri(np.clip(corners, _RARE, 1 - _RARE)).T.take(cell_of, axis=0).T
+    normal = ndtri(np.clip(corners, _RARE, 1 - _RARE))
     for axis_share in share.T:  # each axis halves the number of corners
         low, high = np.split(normal, 2)
         normal = low + axis_share * (high - low)

@@ -15,7 +15,7 @@ from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, SweepTruth
 from densify.street.cameras import CAMERAS, EXPOSURES, Picture, expose
 from densify.street.lidar import Mount, Returns, Sensor, T_ego_lidar, at_offsets, scan
-from densify.street.motion import DURATION_S
+from densify.street.motion import DURATION_S, Poses
 from densify.street.scenes import Scene, build
 from densify.street.world import Body
 
@@ -42,8 +42,7 @@ class Bodies:
             points: (N,3) metres, each in the frame of its body.
         """
         T_world_body = self.T_world_body[frame][body]
-        placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
-        return placed + T_world_body[:, :3, 3]
+        return Poses(T_world_body[:, :3, :3], T_world_body[:, :3, 3]).apply(points)
 
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
