@@ -60,14 +60,16 @@ class TruthMap(NamedTuple):
     by_disparity: bool
     baseline_m: float = KITTI_BASELINE_M  # stereo baseline that turns depth into disparity
 
-    def outliers(self, depth_m: Float32, known: Bool, focal_px: float) -> Bool:
-        """Return (K,) True where the depth (H,W) is an outlier at the K pixels ``known`` (H,W)."""
-        judged_m = depth_m[known].astype(np.float64)
-        true_m = self.depth_m[known].astype(np.float64)
+    def outliers(self, depth_m: Float32, focal_px: float) -> Bool:
+        """Return (H,W) True at outliers of a depth map (H,W), False where either has no depth."""
+        known = (self.depth_m > 0) & (depth_m > 0)
+        judged_m, true_m = (m[known].astype(np.float64) for m in (depth_m, self.depth_m))
+        outliers = np.zeros(known.shape, bool)
         if self.by_disparity:
-            return is_outlier_depth(judged_m, true_m, focal_px, self.baseline_m)
-        error_m = np.abs(judged_m - true_m)
-        outliers: Bool = (error_m > _OUTLIER_M) & (error_m > _OUTLIER_FRACTION * true_m)
+            outliers[known] = is_outlier_depth(judged_m, true_m, focal_px, self.baseline_m)
+        else:
+            error_m = np.abs(judged_m - true_m)
+            outliers[known] = (error_m > _OUTLIER_M) & (error_m > _OUTLIER_FRACTION * true_m)
         return outliers
 
 
@@ -195,8 +197,7 @@ def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: fl
     agrees = np.zeros(depth_m.shape, bool)
     for shift in range(-reach_px, reach_px + 1):
         beside = truth._replace(depth_m=np.roll(truth.depth_m, shift, axis=1))
-        known = (beside.depth_m > 0) & (depth_m > 0)
-        agrees[known] |= ~beside.outliers(depth_m, known, focal_px)
+        agrees |= (beside.depth_m > 0) & (depth_m > 0) & ~beside.outliers(depth_m, focal_px)
     return agrees
 
 
@@ -274,13 +275,10 @@ class _Sums:
             for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
                 self._densities[product].append(image_density(depth_m))
                 for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
-                    has_truth = truth.depth_m > 0
-                    groups = {"all": has_truth, "moving": has_truth & truth.moving}
-                    for group, known in groups.items():
-                        compared = known & (depth_m > 0)
-                        outliers = truth.outliers(depth_m, compared, focal_px)
-                        counts = (known.sum(), compared.sum(), outliers.sum())
-                        self._counts[source, product, group] += counts
+                    known, outliers = truth.depth_m > 0, truth.outliers(depth_m, focal_px)
+                    masks = np.stack([known, known & (depth_m > 0), outliers])
+                    self._counts[source, product, "all"] += masks.sum(axis=(1, 2))
+                    self._counts[source, product, "moving"] += masks[:, truth.moving].sum(axis=1)
         for scores in (result.metrics.get("held_out") or {}).values():
             for product, group in cartesian(PRODUCTS, _GROUPS):
                 score = scores[product][group]

@@ -206,9 +206,7 @@ def judged_maps(
         depth_m = depth.filled_m
         if depth.rejected is not None:
             depth_m = np.maximum(depth_m, depth.rejected.depth_m)
-        compared = (truth.depth_m > 0) & (depth_m > 0)
-        outlier = np.zeros(compared.shape, bool)
-        outlier[compared] = truth.outliers(depth_m, compared, focal_px)
+        outlier = truth.outliers(depth_m, focal_px)
         if key.truth == "stereo":
             outlier &= ~agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
         yield JudgedMap(key, depth, truth, outlier)
@@ -302,14 +300,13 @@ class Subject(NamedTuple):
         if self.key.truth == "stereo":
             groups["aside"] = known  # without outliers at widened posts
         for product, depth_m in (("measured", depth.depth_m), ("filled", depth.filled_m)):
+            outliers = truth.outliers(depth_m, focal_px)
             for group, pixels in groups.items():
+                if group == "aside":  # the last group
+                    outliers &= ~agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
                 compared = pixels & (depth_m > 0)
-                outliers = truth.outliers(depth_m, compared, focal_px)
-                if group == "aside":
-                    beside = agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
-                    outliers &= ~beside[compared]
-                confidence = depth.confidence[compared]
-                curves[f"{product} {group}"] = curve(int(pixels.sum()), confidence, outliers)
+                judged = depth.confidence[compared], outliers[compared]
+                curves[f"{product} {group}"] = curve(int(pixels.sum()), *judged)
         return curves
 
     def depth_and_truth(
