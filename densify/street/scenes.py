@@ -327,7 +327,8 @@ def _furnish(scenery: Scenery, side: Side, spacing_m: float, has_trees: bool) ->
             ahead_m = row.ahead_m if hasattr(row, "ahead_m") else row.ahead_share * spacing_m
             heading, solid = side.heading(station), None
             if row.kind == "tree":
-                heading, (mesh, solid) = 0.0, models.tree(rng)
+                mesh, solid = models.tree(rng)
+                heading = 0.0
             elif row.kind == "sign_post":
                 mesh = models.sign_post(rng)
                 heading += np.pi * (side.side > 0)  # signs face the traffic
@@ -468,15 +469,18 @@ class Traffic:
             return ground.kerb_m * np.clip(beyond_m / _KERB_RAMP_M, 0, 1)
 
         if speed is None:
-            is_range = isinstance(row.m_s, list)
-            lowest, highest = row.m_s if is_range else (-row.vary_m_s, row.vary_m_s)
-            speed = Speed((0.0, rng.uniform(lowest, highest) + (0.0 if is_range else row.m_s)))
+            if isinstance(row.m_s, list):
+                m_s = rng.uniform(*row.m_s)
+            else:
+                m_s = row.m_s + rng.uniform(-row.vary_m_s, row.vary_m_s)
+            speed = Speed((0.0, m_s))
         driving = Driving(
             lane.curve, speed, arc_m, _TABLES.meeting_s, ground.terrain, WHEELBASE_M[row.kind],
             lift if is_walker else None, upright=is_walker,
         )  # fmt: skip
-        make_actor = getattr(models, row.kind)  # "car", "truck", "cyclist" or "walker"
-        return make_actor(driving, len(self.actors), rng)  # type: ignore[no-any-return]
+        # The kind is the name of a function: car, truck, cyclist or walker.
+        actor: Actor = getattr(models, row.kind)(driving, len(self.actors), rng)
+        return actor
 
 
 PRESETS = {
