@@ -88,7 +88,7 @@ class Mesh:
 
         Texture x is along the first side. ``tint`` is (3,) for all quads or (K,3).
         """
-        num = len(corners)
+        corners, num = np.asarray(corners, float), len(corners)
         first_side = corners[:, 1] - corners[:, 0]
         last_side = corners[:, 3] - corners[:, 0]
         # Two perpendicular axes in the plane of each quad are the axes of its texture.

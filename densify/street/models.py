@@ -114,14 +114,9 @@ def _sheet(left: Any, material: Material, tint: Tint = WHITE) -> Mesh:
     return Mesh.quads(_panels(line * _MIRROR, line), material, tint)
 
 
-def _quads(corners: Any, material: Material, tint: Tint = WHITE) -> Mesh:
-    """Return quads from lists of corners."""
-    return Mesh.quads(np.array(corners, float), material, tint)
-
-
 _SOLIDS: dict[str, Callable[..., Mesh]] = {
     "box": box, "frustum": frustum, "tube": tube, "ball": ball,
-    "sides": _sides, "sheet": _sheet, "quads": _quads,
+    "sides": _sides, "sheet": _sheet, "quads": Mesh.quads,
 }  # fmt: skip
 
 # Vehicles and people

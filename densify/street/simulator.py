@@ -175,15 +175,11 @@ def seconds(time_ns: int) -> float:
 
 def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
     """Return (F,B) True if the body is part of an object that moves around that time."""
-
-    def positions(shift_s: float) -> Float:
-        columns = [body.trajectory.poses(times_s + shift_s).position for body in bodies]
-        return np.stack(columns, axis=1)
-
-    now = positions(0.0)
-    shifts_s = _MOVING_S * np.array([-1, -0.5, 0.5, 1])
-    moved_m = [np.linalg.norm(positions(shift_s) - now, axis=2) for shift_s in shifts_s]
-    moving: Bool = np.max(moved_m, axis=0) >= _MOVING_M
+    times = times_s[:, None] + _MOVING_S * np.array([0, -1, -0.5, 0.5, 1])
+    columns = [body.trajectory.poses(times.ravel()).position for body in bodies]
+    position = np.stack(columns, axis=1).reshape(*times.shape, len(bodies), 3)
+    moved_m = np.linalg.norm(position[:, 1:] - position[:, :1], axis=3).max(axis=1)
+    moving: Bool = moved_m >= _MOVING_M
     # An object moves if one of its bodies moves.
     instance = np.array([body.instance for body in bodies])
     for number in np.unique(instance[instance >= 0]):
