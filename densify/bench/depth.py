@@ -282,8 +282,8 @@ class _Sums:
         for scores in (result.metrics.get("held_out") or {}).values():
             for product, group in cartesian(PRODUCTS, _GROUPS):
                 score = scores[product][group]
-                outliers = round((score["outliers"] or 0.0) * score["num_compared"])
-                counts = (score["num_pixels"], score["num_compared"], outliers)
+                num_outliers = round((score["outliers"] or 0.0) * score["num_compared"])
+                counts = (score["num_pixels"], score["num_compared"], num_outliers)
                 self._counts["key held out", product, group] += counts
 
     def numbers(self, num_keys: int) -> dict[str, Any]:
