@@ -363,13 +363,10 @@ class TinyTruth:
     def moving_mask(self, camera: str, frame: int) -> np.ndarray:
         return self._view(camera, frame)[1]
 
-    def _view(self, camera: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        moment = camera, frame, self.sequence.late_s
-        if moment not in self._seen:
-            self._seen[moment] = self._cast(camera, frame)
-        return self._seen[moment]
-
-    def _cast(self, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    def _view(self, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        moment = name, frame, self.sequence.late_s
+        if moment in self._seen:
+            return self._seen[moment]
         camera, scene = self.sequence.cameras[name], self.sequence.scene
         time_s = frame * SWEEP_S + self.sequence.late_s
         T_world_cam = scene.T_world_lidar(time_s) @ poses.inverse(camera.T_cam_lidar)
@@ -384,4 +381,5 @@ class TinyTruth:
         )
         instances = np.array([b.instance for b in scene.world.boxes] + [-1, -1])
         near = np.where(depth < 80, depth, 0).astype(np.float32)
-        return near.T.copy(), (instances[met] >= 0).T.copy()
+        self._seen[moment] = near.T.copy(), (instances[met] >= 0).T.copy()
+        return self._seen[moment]

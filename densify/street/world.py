@@ -202,7 +202,7 @@ class World:
     def _cast_at_body(
         self, body: int, origin: Float, direction: Float, number: Int, optics: Optics
     ) -> Hits:
-        """Return the hits of N rays with one body, in its frame; ``number`` (N,) has ray indices."""
+        """Return the hits of rays with one body, in its frame; ``number`` (N,) has ray indices."""
         # Distances are to the plane of the triangle, in double precision, also for absorbed rays.
         surfaces = self.triangles
         n = len(origin)
