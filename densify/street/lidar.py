@@ -424,8 +424,7 @@ def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> tupl
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
         plane_distance = np.abs(range_m - (range_m * slant)[:, :1] / slant)
     is_hit = np.isfinite(range_m)
-    is_flat = plane_distance < _FLAT_M
-    is_edge = np.logical_or.reduce([*is_hit.T]) & ~np.logical_and.reduce([*is_flat.T])
+    is_edge = is_hit.any(axis=1) & ~(plane_distance < _FLAT_M).all(axis=1)
 
     # One of the rays with a hit is chosen at random; a second ray may merge with it.
     edges = np.flatnonzero(is_edge)
