@@ -152,12 +152,12 @@ class Scan:
     instance: np.ndarray
 
 
-@dataclass
+@dataclass(frozen=True)
 class Scene:
     """Frames 0, 1, 2, …: frame f's reference time is f · 0.1 s."""
 
     world: World
-    ego: Arc = field(default_factory=lambda: Arc(0.0, -1.5))
+    ego: Arc = Arc(0.0, -1.5)
     scanner: Scanner = Scanner()
     seed: int = 0
 
@@ -169,46 +169,7 @@ class Scene:
         return T
 
     def scan(self, frame: int) -> Scan:
-        return _scan(self.world, self.ego, self.scanner, self.seed, frame)
-
-    def cast(self, frame: int) -> Scan:
-        """As `scan`, which remembers."""
-        s, rng = self.scanner, np.random.default_rng([self.seed, frame])
-        offset_s = ((np.arange(s.num_azimuths) + 0.5) / s.num_azimuths - 0.5) * SWEEP_S
-        azimuth = -2 * np.pi * offset_s / SWEEP_S  # clockwise
-        elevation = np.deg2rad(np.linspace(*s.elevation_deg, s.num_beams))
-        ray = np.stack(
-            np.broadcast_arrays(
-                np.cos(azimuth)[:, None] * np.cos(elevation),
-                np.sin(azimuth)[:, None] * np.cos(elevation),
-                np.sin(elevation),
-            ),
-            -1,
-        )
-        x, y, yaw = self.ego.at(frame * SWEEP_S + offset_s)
-        origin = np.stack([x, y, self.world.slope * x + LIDAR_HEIGHT_M], -1)
-        c, sn = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-        direction = np.stack(
-            [c * ray[..., 0] - sn * ray[..., 1], sn * ray[..., 0] + c * ray[..., 1], ray[..., 2]],
-            -1,
-        )
-        range_m, met = self.world.cast(origin, direction, frame * SWEEP_S + offset_s, rng)
-        keep = range_m < s.max_range_m
-        measured = range_m + s.sigma_m * rng.standard_normal(range_m.shape)
-        offset_ns = np.rint(offset_s * 1e9).astype(np.int64)[:, None]
-        n, box = int(keep.sum()), met[keep]
-        instances = np.array([b.instance for b in self.world.boxes] + [-1, -1], np.int32)
-        sweep = Sweep(
-            frame=frame,
-            stamp_ns=stamp_ns(frame),
-            points=(ray * measured[..., None])[keep],
-            intensity=(0.1 + 0.8 * (box % 7) / 7).astype(np.float32),
-            offset_ns=np.broadcast_to(offset_ns, keep.shape)[keep].copy(),
-            lidar=np.zeros(n, np.uint8),
-            row=np.arange(n),
-        )
-        world = (origin[:, None] + direction * measured[..., None])[keep]
-        return Scan(sweep, world, box, instances[box])
+        return _scan(self, frame)
 
     def height_m(self, frame: int) -> np.ndarray:
         """(N,) true height above the ground."""
@@ -249,9 +210,44 @@ class Scene:
 
 
 @lru_cache(maxsize=64)
-def _scan(world: World, ego: Arc, scanner: Scanner, seed: int, frame: int) -> Scan:
+def _scan(scene: Scene, frame: int) -> Scan:
     """The same for all scenes that are alike: tests make them anew."""
-    return Scene(world, ego, scanner, seed).cast(frame)
+    s, rng = scene.scanner, np.random.default_rng([scene.seed, frame])
+    offset_s = ((np.arange(s.num_azimuths) + 0.5) / s.num_azimuths - 0.5) * SWEEP_S
+    azimuth = -2 * np.pi * offset_s / SWEEP_S  # clockwise
+    elevation = np.deg2rad(np.linspace(*s.elevation_deg, s.num_beams))
+    ray = np.stack(
+        np.broadcast_arrays(
+            np.cos(azimuth)[:, None] * np.cos(elevation),
+            np.sin(azimuth)[:, None] * np.cos(elevation),
+            np.sin(elevation),
+        ),
+        -1,
+    )
+    x, y, yaw = scene.ego.at(frame * SWEEP_S + offset_s)
+    origin = np.stack([x, y, scene.world.slope * x + LIDAR_HEIGHT_M], -1)
+    c, sn = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    direction = np.stack(
+        [c * ray[..., 0] - sn * ray[..., 1], sn * ray[..., 0] + c * ray[..., 1], ray[..., 2]],
+        -1,
+    )
+    range_m, met = scene.world.cast(origin, direction, frame * SWEEP_S + offset_s, rng)
+    keep = range_m < s.max_range_m
+    measured = range_m + s.sigma_m * rng.standard_normal(range_m.shape)
+    offset_ns = np.rint(offset_s * 1e9).astype(np.int64)[:, None]
+    n, box = int(keep.sum()), met[keep]
+    instances = np.array([b.instance for b in scene.world.boxes] + [-1, -1], np.int32)
+    sweep = Sweep(
+        frame=frame,
+        stamp_ns=stamp_ns(frame),
+        points=(ray * measured[..., None])[keep],
+        intensity=(0.1 + 0.8 * (box % 7) / 7).astype(np.float32),
+        offset_ns=np.broadcast_to(offset_ns, keep.shape)[keep].copy(),
+        lidar=np.zeros(n, np.uint8),
+        row=np.arange(n),
+    )
+    world = (origin[:, None] + direction * measured[..., None])[keep]
+    return Scan(sweep, world, box, instances[box])
 
 
 def stamp_ns(frame: int) -> int:
@@ -367,13 +363,10 @@ class TinyTruth:
     def moving_mask(self, camera: str, frame: int) -> np.ndarray:
         return self._view(camera, frame)[1]
 
-    def _view(self, camera: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        moment = camera, frame, self.sequence.late_s
-        if moment not in self._seen:
-            self._seen[moment] = self._cast(camera, frame)
-        return self._seen[moment]
-
-    def _cast(self, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    def _view(self, name: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        moment = name, frame, self.sequence.late_s
+        if moment in self._seen:
+            return self._seen[moment]
         camera, scene = self.sequence.cameras[name], self.sequence.scene
         time_s = frame * SWEEP_S + self.sequence.late_s
         T_world_cam = scene.T_world_lidar(time_s) @ poses.inverse(camera.T_cam_lidar)
@@ -388,4 +381,5 @@ class TinyTruth:
         )
         instances = np.array([b.instance for b in scene.world.boxes] + [-1, -1])
         near = np.where(depth < 80, depth, 0).astype(np.float32)
-        return near.T.copy(), (instances[met] >= 0).T.copy()
+        self._seen[moment] = near.T.copy(), (instances[met] >= 0).T.copy()
+        return self._seen[moment]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from densify.bench import flow as flow_bench
+from densify.bench.baselines import ip_basic
 from densify.bench.depth import bench_depth
 from densify.bench.flow import bench_flow
 from densify.cli import main
@@ -111,6 +112,26 @@ def test_methods_of_flow_do_what_they_are_for():
         assert error_m <= ours["window"]["movers_m_by_hops"][n] + 1e-9
 
 
+def sampled(depth_m: np.ndarray) -> np.ndarray:
+    """One pixel in sixteen."""
+    sparse_m = np.zeros_like(depth_m)
+    sparse_m[2::4, 2::4] = depth_m[2::4, 2::4]
+    return sparse_m
+
+
+def test_ip_basic_fills_a_wall_not_a_large_hole_and_smears_silhouettes_little():
+    wall_m = np.full((80, 200), 20.0, np.float32)
+    wall_m[:, 80:] = 0
+    filled_m = ip_basic(sampled(wall_m))
+    np.testing.assert_allclose(filled_m[8:-8, 8:76], 20.0, atol=1e-4)
+    assert not filled_m[:, 110:].any()
+    scene_m = np.full((80, 200), 40.0, np.float32)
+    scene_m[:, 100:] = 10.0
+    filled_m = ip_basic(sampled(scene_m))
+    assert filled_m.min() > 9.9 and (filled_m[8:-8, 8:90] > 39.9).all()
+    assert (filled_m[8:-8, 103:190] < 10.1).all()
+
+
 @pytest.mark.parametrize(
     ("measure", "words"),
     [
@@ -139,14 +160,10 @@ def test_the_commands_print_tables_or_numbers(border_drive, capsys):
     assert "did you mean flow?" in refused(capsys, 2, "bench", "readme", "flows")
 
 
-def test_scenes_of_the_readme_open_and_its_tables_are_in_the_results():
-    text = RESULTS.read_text("utf-8")
-    for name, table in flow_bench.TABLES.items():
-        assert f"densify bench readme {name}" in text
-        assert all(street.key in open_sequence(street.data).frames for street in table.scenes)
-
-
 def test_rows_of_the_readme(capsys, monkeypatch):
+    for name, table in flow_bench.TABLES.items():
+        assert f"densify bench readme {name}" in RESULTS.read_text("utf-8")
+        assert all(street.key in open_sequence(street.data).frames for street in table.scenes)
     chosen = {
         name: flow_bench.TABLES[name]._replace(scenes=(flow_bench.KeySweep("car", KEY, window=1),))
         for name in ("flow", "registration")

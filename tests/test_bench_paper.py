@@ -9,18 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from densify.bench.paper import (
-    METHODS,
-    bench_paper,
-    has_truth,
-    pair_of_recording,
-    pairs_of_files,
-    read_pair,
-)
-from densify.config.errors import InputError
+from densify.bench import paper
+from densify.bench.paper import METHODS, bench_paper, pair_of_recording, pairs_of_files, read_pair
 from densify.learning.network import Model, build, write_model
 from densify.readers.street import Street
 from tests.command import exit_code, refused
+from tests.exported import refusal
 from tests.writers import write_street
 
 STEP = np.array([0.3, 0.1, 0.0])
@@ -65,16 +59,16 @@ def test_flyingthings_comes_in_camera_axes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"gt": None}, r"holds pos1, pos2, expected points1, points2 and flow, or pos1"),
+        ({"gt": None}, "holds pos1, pos2, expected points1, points2 and flow, or pos1"),
         ({"gt": np.zeros((5, 3))}, "gt: got 5 rows, expected 600"),
-        ({"pos2": np.zeros((5, 2))}, r"pos2: got shape \(5, 2\), expected \(N,3\) numbers"),
+        ({"pos2": np.zeros((5, 2))}, "pos2: got shape (5, 2), expected (N,3) numbers"),
         ({"pos1": np.full((600, 3), np.nan)}, "pos1: got shape"),
         ({"pos1": np.full((600, 3), 99.0)}, "no valid point within 35 m ahead"),
     ],
     ids=str,
 )
 def test_another_npz_is_refused(tmp_path: Path, changes, words: str) -> None:
-    with pytest.raises(InputError, match=words):
+    with refusal(words):
         read_pair(kitti_file(tmp_path / "a.npz", **changes))
 
 
@@ -96,7 +90,7 @@ def test_without_truth_networks_are_held_against_the_engine(tmp_path: Path) -> N
     street = Street("street", 5, "vlp16", cameras=())
     log = write_street("argoverse2", street, tmp_path / "log", range(58, 61))
     bare = shutil.copytree(log, tmp_path / "bare", ignore=shutil.ignore_patterns("truth"))
-    assert has_truth(str(log)) and not has_truth(str(bare))
+    assert paper.has_truth(str(log)) and not paper.has_truth(str(bare))
     exact, estimated = (pair_of_recording(str(path), 1) for path in (log, bare))
     assert exact.moving.any() and not exact.flow[~exact.moving].any() and len(exact.sweeps) == 5
     assert exact.source.shape == exact.flow.shape == tuple(exact.sweeps[0].points.shape)

@@ -81,8 +81,7 @@ def test_a_verdict_needs_more_than_luck_and_more_than_the_spread_of_keys() -> No
     assert word([0.1, 0.1, 0.1, 0.1], 0.05) == "worse"
     assert word([0.4, 0.0, 0.0, 0.0], 0.05) == "no difference"  # one key alone
 
-
-def test_recall_is_better_when_larger() -> None:
+    # Recall is better when larger.
     before, luck = {"flow recall %": 90.0}, {"flow recall %": 1.0}
     (verdict,) = verdicts({"a": before}, {"a": {"flow recall %": 80.0}}, {})
     assert verdict.word == "worse" and verdict.worst == ("a", -10.0)

@@ -9,7 +9,7 @@ and within 80 m. ``key held out``: returns of the key sweep, for a map made from
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product as cartesian
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,14 +60,16 @@ class TruthMap(NamedTuple):
     by_disparity: bool
     baseline_m: float = KITTI_BASELINE_M  # stereo baseline that turns depth into disparity
 
-    def outliers(self, depth_m: Float32, known: Bool, focal_px: float) -> Bool:
-        """Return (K,) True where the depth (H,W) is an outlier at the K pixels ``known`` (H,W)."""
-        judged_m = depth_m[known].astype(np.float64)
-        true_m = self.depth_m[known].astype(np.float64)
+    def outliers(self, depth_m: Float32, focal_px: float) -> Bool:
+        """Return (H,W) True at outliers of a depth map (H,W), False where either has no depth."""
+        known = (self.depth_m > 0) & (depth_m > 0)
+        judged_m, true_m = (m[known].astype(np.float64) for m in (depth_m, self.depth_m))
+        outliers = np.zeros(known.shape, bool)
         if self.by_disparity:
-            return is_outlier_depth(judged_m, true_m, focal_px, self.baseline_m)
-        error_m = np.abs(judged_m - true_m)
-        outliers: Bool = (error_m > _OUTLIER_M) & (error_m > _OUTLIER_FRACTION * true_m)
+            outliers[known] = is_outlier_depth(judged_m, true_m, focal_px, self.baseline_m)
+        else:
+            error_m = np.abs(judged_m - true_m)
+            outliers[known] = (error_m > _OUTLIER_M) & (error_m > _OUTLIER_FRACTION * true_m)
         return outliers
 
 
@@ -195,8 +197,7 @@ def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: fl
     agrees = np.zeros(depth_m.shape, bool)
     for shift in range(-reach_px, reach_px + 1):
         beside = truth._replace(depth_m=np.roll(truth.depth_m, shift, axis=1))
-        known = (beside.depth_m > 0) & (depth_m > 0)
-        agrees[known] |= ~beside.outliers(depth_m, known, focal_px)
+        agrees |= (beside.depth_m > 0) & (depth_m > 0) & ~beside.outliers(depth_m, focal_px)
     return agrees
 
 
@@ -225,7 +226,7 @@ def bench_depth(
             and the filled map; ``seconds`` of projection per key sweep; ``scores`` (num_pixels,
             coverage, outliers) by ground truth, map (measured, filled) and pixels (all, moving).
     """
-    choose_cameras(sequence, cameras)
+    chosen = choose_cameras(sequence, cameras)
     if method not in METHODS:
         raise InputError(f"--method {method}: expected one of {', '.join(METHODS)}")
     if scanner is not None and not np.any(sequence[keys[0]].lidar == scanner):
@@ -234,7 +235,7 @@ def bench_depth(
     sums = {name: _Sums() for name in variants}
     for number, key in enumerate(keys):
         for name, config in variants.items():
-            shots = key_shots(sequence, choose_cameras(sequence, cameras), key, config.project)
+            shots = key_shots(sequence, chosen, key, config.project)
             truths = {}
             if scanner is not None:
                 whole = Recording(sequence, config, window, [key], looks_around=True)
@@ -258,7 +259,7 @@ class _Sums:
     def __init__(self) -> None:
         # Pixels with a true depth, those that have a depth in the map too, outliers among these
         self._counts: defaultdict[tuple[str, str, str], Any] = defaultdict(lambda: np.zeros(3, int))
-        self._densities: dict[str, list[float]] = {product: [] for product in PRODUCTS}
+        self._densities: defaultdict[str, list[float]] = defaultdict(list)
         self._seconds = 0.0
 
     def add(
@@ -274,36 +275,26 @@ class _Sums:
             for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
                 self._densities[product].append(image_density(depth_m))
                 for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
-                    for group, counts in _counted(depth_m, truth, focal_px):
-                        self._counts[source, product, group] += counts
+                    known, outliers = truth.depth_m > 0, truth.outliers(depth_m, focal_px)
+                    masks = np.stack([known, known & (depth_m > 0), outliers])
+                    self._counts[source, product, "all"] += masks.sum(axis=(1, 2))
+                    self._counts[source, product, "moving"] += masks[:, truth.moving].sum(axis=1)
         for scores in (result.metrics.get("held_out") or {}).values():
             for product, group in cartesian(PRODUCTS, _GROUPS):
                 score = scores[product][group]
-                outliers = round((score["outliers"] or 0.0) * score["num_compared"])
-                counts = (score["num_pixels"], score["num_compared"], outliers)
+                num_outliers = round((score["outliers"] or 0.0) * score["num_compared"])
+                counts = (score["num_pixels"], score["num_compared"], num_outliers)
                 self._counts["key held out", product, group] += counts
 
     def numbers(self, num_keys: int) -> dict[str, Any]:
         """Return density, seconds and scores of a variant, see `bench_depth`."""
         scores: dict[str, Any] = {}
-        for (source, product, group), (num, compared, outliers) in self._counts.items():
+        for (source, product, group), counts in self._counts.items():
+            num, compared, outliers = counts.tolist()
             scores.setdefault(source, {}).setdefault(product, {})[group] = {
-                "num_pixels": int(num),
+                "num_pixels": num,
                 "coverage": compared / num if num else None,
                 "outliers": outliers / compared if compared else None,
             }
-        density = {
-            product: float(np.mean(shares)) for product, shares in self._densities.items() if shares
-        }
+        density = {product: float(np.mean(shares)) for product, shares in self._densities.items()}
         return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}
-
-
-def _counted(
-    depth_m: Float32, truth: TruthMap, focal_px: float
-) -> Iterator[tuple[str, tuple[int, int, int]]]:
-    """Yield "all" and "moving" pixels, each with its three counts of `_Sums`."""
-    for group in _GROUPS:
-        known = (truth.depth_m > 0) & (truth.moving if group == "moving" else True)
-        compared = known & (depth_m > 0)
-        outliers = truth.outliers(depth_m, compared, focal_px)
-        yield group, (int(known.sum()), int(compared.sum()), int(outliers.sum()))

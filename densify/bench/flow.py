@@ -9,7 +9,6 @@ key sweep. ``densify bench readme`` makes the tables of docs/flow-results.md aga
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,8 +122,7 @@ class SweepTruth(NamedTuple):
     @staticmethod
     def of(truth: Truth, stretch: Stretch, frame: int, key: int) -> SweepTruth:
         """Return the exact ground truth of the sweep with the number ``frame`` in a window."""
-        rows = stretch[frame].sweep.row
-        frames = stretch.frames
+        rows, frames = stretch[frame].sweep.row, stretch.frames
         targets = (towards(key, frame, frames), key, frames[0], frames[-1])
         step, to_key, to_first, to_last = (
             truth.displacement(frame, target)[rows] for target in targets
@@ -209,12 +207,10 @@ class Scorer:
         if truths is None:
             moving = np.concatenate([steps[f].moving for f in self.sources])
             return {"called_moving": float(moving.mean())}
-        flow = self._above(lambda f: steps[f].displacement)
-        true = self._above(lambda f: truths[f].step)
-        moving = self._above(lambda f: truths[f].moving)
-        objects = self._above(lambda f: truths[f].foreground)
-        called = self._above(lambda f: steps[f].moving)
-        certain = self._above(lambda f: truths[f].certain)
+        flow, called = (self._above(steps, name) for name in ("displacement", "moving"))
+        true, moving, objects, certain = (
+            self._above(truths, name) for name in ("step", "moving", "foreground", "certain")
+        )
         static = np.concatenate([steps[f].moving[~truths[f].moving] for f in self.sources])
         return {
             "num_movers": int(moving.sum()),
@@ -232,29 +228,28 @@ class Scorer:
         Errors are metres, above the ground, by number of sweeps to the key: ``movers_m_by_hops`` of
         moving points, ``found_movers_m_by_hops`` of those called moving.
         """
-        stretch, key = self.stretch, self.key
-        frames = stretch.frames
+        stretch, key, frames = self.stretch, self.key, self.stretch.frames
         cloud = accumulate(stretch, [to_key[f] for f in frames], key, drop_lost=True)
         scores: dict[str, Any] = {"ghost_rate": ghost_rate(cloud, RangeImage.of(stretch[key]), key)}
         if self.truths is None:
             return scores
-        errors_m: dict[str, list[Float]] = defaultdict(list)
-        called_m: dict[str, list[Float]] = defaultdict(list)
+        errors_m: dict[str, dict[str, list[Float]]] = {"movers": {}, "found_movers": {}}
         for frame, truth in self.truths.items():
             if frame != key:
                 field, hops = to_key[frame], str(abs(frames.index(key) - frames.index(frame)))
                 kept = truth.moving & self.above[frame] & ~field.lost
                 error_m = end_point_errors(field.displacement, truth.to_key)
-                errors_m[hops].append(error_m[kept])
-                called_m[hops].append(error_m[kept & field.moving])
-        for name, by_hops in (("movers", errors_m), ("found_movers", called_m)):
+                for name, rows in (("movers", kept), ("found_movers", kept & field.moving)):
+                    errors_m[name].setdefault(hops, []).append(error_m[rows])
+        for name, by_hops in errors_m.items():
             means = {hops: mean_of(np.concatenate(by_hops[hops])) for hops in sorted(by_hops)}
             scores[f"{name}_m_by_hops"] = means
         return scores
 
-    def _above(self, column: Callable[[int], Any]) -> Any:
-        """Return values of points above the ground; ``column`` maps frame number -> (N,) values."""
-        return np.concatenate([column(f)[self.above[f]] for f in self.sources])
+    def _above(self, of_frame: Mapping[int, Any], name: str) -> Any:
+        """Return a pooled column of frame -> truth or flow, of the points above the ground."""
+        columns = (getattr(of_frame[f], name)[self.above[f]] for f in self.sources)
+        return np.concatenate([*columns])
 
 
 def towards(key: int, frame: int, frames: Sequence[int]) -> int:
@@ -346,22 +341,17 @@ def tables(names: Sequence[str], progress: Progress | None = None) -> Iterator[s
     for number, table in enumerate(chosen):
         yield "\n" * (number > 0) + f"{table.about}\n"
         yield f"| | {table.titles} |"
-        yield _line(["---"] * (table.titles.count("|") + 2))
+        yield "| --- " * (table.titles.count("|") + 2) + "|"
         for scene in table.scenes:
-            yield _line(table.row(scene))
+            yield f"| {' | '.join(table.row(scene))} |"
             done += 1
             if progress is not None:
                 progress("bench", done, num_scenes)
 
 
-def _line(cells: Sequence[str]) -> str:
-    """Return a row of a Markdown table."""
-    return f"| {' | '.join(cells)} |"
-
-
 def _times_100(value: float | None, digits: int, unit: str) -> str:
     """Return 100 times a value with its unit, a dash for None."""
-    return ("–" if value is None else f"{100 * value:.{digits}f}") + unit * (value is not None)
+    return "–" if value is None else f"{100 * value:.{digits}f}{unit}"
 
 
 def _row_of_flow(scene: KeySweep) -> list[str]:

@@ -35,7 +35,6 @@ from densify.geometry.types import (
     Camera,
     DepthMap,
     Float,
-    FlowField,
     LidarSequence,
     Progress,
     Sweep,
@@ -50,6 +49,7 @@ from densify.pipeline.run import scene_of
 from densify.readers import open_sequence
 from densify.readers.timeline import choose_cameras
 from densify.registration.trajectory import Registration
+from densify.scores.flow_metrics import end_point_errors
 from densify.scores.pose_metrics import window_pose_errors
 
 KINDS = ("depth", "flow", "registration")
@@ -206,9 +206,7 @@ def judged_maps(
         depth_m = depth.filled_m
         if depth.rejected is not None:
             depth_m = np.maximum(depth_m, depth.rejected.depth_m)
-        compared = (truth.depth_m > 0) & (depth_m > 0)
-        outlier = np.zeros(compared.shape, bool)
-        outlier[compared] = truth.outliers(depth_m, compared, focal_px)
+        outlier = truth.outliers(depth_m, focal_px)
         if key.truth == "stereo":
             outlier &= ~agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
         yield JudgedMap(key, depth, truth, outlier)
@@ -233,20 +231,14 @@ def _opened(key: GateKey, folder: Path | None) -> LidarSequence:
 
 def _luck(still: Mapping[str, Any], moved: list[dict[str, Any]]) -> dict[str, float]:
     """Return the standard deviation of each change of figures when the poses move."""
-    changes = [
-        {
-            title: value
-            for name in still
-            for title, value in change(name, still[name], figures[name]).items()
-        }
-        for figures in moved
-    ]
-    if len(changes) < 2:
+    changes: dict[str, list[float]] = defaultdict(list)
+    for figures in moved:
+        for name in still:
+            for title, value in change(name, still[name], figures[name]).items():
+                changes[title].append(value)
+    if len(moved) < 2:
         return {}
-    return {
-        title: round(float(np.std([values[title] for values in changes], ddof=1)), 5)
-        for title in changes[0]
-    }
+    return {title: round(float(np.std(values, ddof=1)), 5) for title, values in changes.items()}
 
 
 class Subject(NamedTuple):
@@ -286,8 +278,7 @@ class Subject(NamedTuple):
         if seed is not None:
             recording = _Moved(self.recording, key, seed)
             sequence: Any = Altered(recording.sequence, lambda sweep: _thinned(sweep, seed))
-            settings = recording.settings
-            registered = Recording(sequence, settings, _WINDOW, [key], looks_around=True)
+            registered = Recording(sequence, recording.settings, _WINDOW, [key], looks_around=True)
         figures: dict[str, Any] = {}
         if "depth" in kinds:
             figures |= self._curves(recording)
@@ -309,14 +300,13 @@ class Subject(NamedTuple):
         if self.key.truth == "stereo":
             groups["aside"] = known  # without outliers at widened posts
         for product, depth_m in (("measured", depth.depth_m), ("filled", depth.filled_m)):
+            outliers = truth.outliers(depth_m, focal_px)
             for group, pixels in groups.items():
+                if group == "aside":  # the last group
+                    outliers &= ~agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
                 compared = pixels & (depth_m > 0)
-                outliers = truth.outliers(depth_m, compared, focal_px)
-                if group == "aside":
-                    beside = agrees_beside(truth, depth_m, _ASIDE_PX, focal_px)
-                    outliers &= ~beside[compared]
-                confidence = depth.confidence[compared]
-                curves[f"{product} {group}"] = curve(int(pixels.sum()), confidence, outliers)
+                judged = depth.confidence[compared], outliers[compared]
+                curves[f"{product} {group}"] = curve(int(pixels.sum()), *judged)
         return curves
 
     def depth_and_truth(
@@ -371,66 +361,47 @@ def _thinned(sweep: Sweep, seed: int) -> Sweep:
 def _flow_figures(recording: Recording, key: int) -> dict[str, float]:
     """Return recall, false positives, and errors of the moving points of all sweeps of a window."""
     truth, motion = cast(Truth, recording.sequence.truth), recording.motion(key)
-    moving, called, one_m, to_key_m = list[Bool](), list[Bool](), list[Float](), list[Float]()
+    columns: defaultdict[str, list[Any]] = defaultdict(list)
     for registered in recording.window(key).sweeps:
         frame, row = registered.frame, registered.sweep.row
-        moves = truth.sweep(frame).moving[row]
-        to_key, true_m = motion.flow(frame, key), truth.displacement(frame, key)[row]
-        moving.append(moves)
-        called.append(to_key.moving)
+        moves, to_key = truth.sweep(frame).moving[row], motion.flow(frame, key)
+        columns["moves"].append(moves)
+        columns["called"].append(to_key.moving)
         if abs(frame - key) == _WINDOW:
-            kept = moves & ~to_key.lost
-            to_key_m.append(np.linalg.norm(to_key.displacement - true_m, axis=1)[kept])
+            true_m = truth.displacement(frame, key)[row]
+            error_m = end_point_errors(to_key.displacement, true_m)
+            columns["error over 5 m"].append(error_m[moves & ~to_key.lost])
         if frame < key + _WINDOW:
-            step, true_m = motion.flow(frame, frame + 1), truth.displacement(frame, frame + 1)[row]
-            one_m.append(np.linalg.norm(step.displacement - true_m, axis=1)[moves])
-    moves, calls = np.concatenate(moving), np.concatenate(called)
-    figures = {"flow false %": 100 * float(calls[~moves].mean())}
+            true_m = truth.displacement(frame, frame + 1)[row]
+            error_m = end_point_errors(motion.flow(frame, frame + 1).displacement, true_m)
+            columns["error over 1 m"].append(error_m[moves])
+    pooled = {name: np.concatenate(of_sweeps) for name, of_sweeps in columns.items()}
+    moves, called = pooled["moves"], pooled["called"]
+    figures = {"flow false %": 100 * float(called[~moves].mean())}
     if moves.any():
         figures |= {
-            "flow recall %": 100 * float(calls[moves].mean()),
-            "flow error over 1 sweep m": float(np.concatenate(one_m).mean()),
-            "flow error over 5 sweeps m": float(np.concatenate(to_key_m).mean()),
+            "flow recall %": 100 * float(called[moves].mean()),
+            "flow error over 1 sweep m": float(pooled["error over 1 m"].mean()),
+            "flow error over 5 sweeps m": float(pooled["error over 5 m"].mean()),
         }
     return {name: round(value, 5) for name, value in figures.items()}
 
 
-class _Pair(NamedTuple):
-    """Two neighbouring sweeps that two scanners measured, and the true flow of the first."""
-
-    sweeps: tuple[Sweep, Sweep]
-    T_first_second: Float  # (4,4) recorded motion
-    true_m: Float  # (N,3) flow of the first sweep's points in metres
-    moving: Bool  # (N,) points whose flow is scored
-    static: Bool  # (N,) static points, none if unknown
-
-    @staticmethod
-    def of(key: GateKey, folder: Path | None) -> _Pair:
-        """Open the sweep ``key`` and the next, with recorded poses."""
-        sequence = _opened(key, folder)
-        config = resolve({"register": {"source": "dataset"}})
-        window = Recording(sequence, config, 1, [key.key]).window(key.key)
-        first, second = window[key.key], window[key.key + 1]
-        points = first.sweep.points
-        if key.truth == "car":
-            is_near = np.linalg.norm(points - _CAR_M, axis=1) < _CAR_REACH_M
-            moving, static = is_near & (points[:, 2] > 0), np.zeros(len(points), bool)
-            true_m: Float = np.broadcast_to(_CAR_FLOW_M, points.shape)
-        else:
-            truth, row = cast(Truth, sequence.truth), first.sweep.row
-            true_m = truth.displacement(key.key, key.key + 1)[row]
-            static = ~truth.sweep(key.key).moving[row]
-            moving = ~static & (np.linalg.norm(points[:, :2], axis=1) < _PAIR_REACH_M)
-        T_first_second = poses.inverse(first.T_world_lidar) @ second.T_world_lidar
-        return _Pair((first.sweep, second.sweep), T_first_second, true_m, moving, static)
-
-    def flow(self, rng: np.random.Generator) -> FlowField:
-        """Estimate the flow with slightly other poses."""
-        first, second = self.sweeps
-        stamps_ns = np.array([first.stamp_ns, second.stamp_ns])
-        recorded = Trajectory((0, 1), stamps_ns, np.stack([np.eye(4), self.T_first_second]))
+def _pair_figures(key: GateKey, folder: Path | None) -> dict[str, list[float]]:
+    """Return figures of the flow from sweep ``key`` to the next, in draws with moved poses."""
+    sequence, config = _opened(key, folder), resolve({"register": {"source": "dataset"}})
+    window = Recording(sequence, config, 1, [key.key]).window(key.key)
+    start, end = window[key.key], window[key.key + 1]
+    T_start_end = poses.inverse(start.T_world_lidar) @ end.T_world_lidar
+    first, second = start.sweep, end.sweep
+    stamps_ns = np.array([first.stamp_ns, second.stamp_ns])
+    recorded = Trajectory((0, 1), stamps_ns, np.stack([np.eye(4), T_start_end]))
+    true_m, moving, static = _pair_truth(key, sequence.truth, first)
+    rng = np.random.default_rng(0)
+    figures: dict[str, list[float]] = defaultdict(list)
+    for _ in range(_NUM_DRAWS):
         T_first, T_second = _jittered(recorded, rng).T_world_lidar
-        return estimate_flow(
+        flow = estimate_flow(
             first.points,
             poses.transform(poses.inverse(T_first) @ T_second, second.points),
             source_offset_ns=first.offset_ns,
@@ -438,18 +409,26 @@ class _Pair(NamedTuple):
             source_lidar=first.lidar,
             target_lidar=second.lidar,
         )
-
-
-def _pair_figures(key: GateKey, folder: Path | None) -> dict[str, list[float]]:
-    """Return figures of the flow from sweep ``key`` to the next, in draws with moved poses."""
-    pair, rng = _Pair.of(key, folder), np.random.default_rng(0)
-    figures: dict[str, list[float]] = defaultdict(list)
-    for _ in range(_NUM_DRAWS):
-        flow = pair.flow(rng)
-        error_m = np.linalg.norm(flow.displacement - pair.true_m, axis=1)[flow.moving & pair.moving]
-        error_of_zero_m = float(np.linalg.norm(pair.true_m[0]))
-        figures["pair recall %"].append(100 * float(flow.moving[pair.moving].mean()))
+        error_m = end_point_errors(flow.displacement, true_m)[flow.moving & moving]
+        error_of_zero_m = float(np.linalg.norm(true_m[0]))
+        figures["pair recall %"].append(100 * float(flow.moving[moving].mean()))
         figures["pair error m"].append(float(error_m.mean()) if len(error_m) else error_of_zero_m)
-        if pair.static.any():
-            figures["pair false %"].append(100 * float(flow.moving[pair.static].mean()))
+        if static.any():
+            figures["pair false %"].append(100 * float(flow.moving[static].mean()))
     return {name: [round(value, 5) for value in values] for name, values in figures.items()}
+
+
+def _pair_truth(key: GateKey, truth: Truth | None, first: Sweep) -> tuple[Float, Bool, Bool]:
+    """Return the true flow (N,3) of a pair's first sweep, and masks of the points scored by it.
+
+    The masks (N,) are of moving points and of static points, none if unknown.
+    """
+    points = first.points
+    if truth is None:  # the pair of Argoverse 2
+        is_near = np.linalg.norm(points - _CAR_M, axis=1) < _CAR_REACH_M
+        true_m: Float = np.broadcast_to(_CAR_FLOW_M, points.shape)
+        return true_m, is_near & (points[:, 2] > 0), np.zeros(len(points), bool)
+    true_m = truth.displacement(key.key, key.key + 1)[first.row]
+    static = ~truth.sweep(key.key).moving[first.row]
+    moving = ~static & (np.linalg.norm(points[:, :2], axis=1) < _PAIR_REACH_M)
+    return true_m, moving, static

@@ -87,7 +87,8 @@ def verdicts(
     Measurements map key -> figure -> value; ``luck`` maps key -> name of a `change` -> its
     deviation.
     """
-    changes: dict[str, dict[str, _KeyChange]] = defaultdict(dict)
+    # Name of the change -> key -> before, now, change and its standard deviation by luck
+    changes: dict[str, dict[str, tuple[float, ...]]] = defaultdict(dict)
     for key in [key for key in before if key in now]:
         for figure in [figure for figure in before[key] if figure in now[key]]:
             old, new = before[key][figure], now[key][figure]
@@ -95,22 +96,12 @@ def verdicts(
                 sigma = luck.get(key, {}).get(name, 0.0)
                 if isinstance(old, Sequence):  # draws have luck of their own
                     sigma = float(np.hypot(np.std(old), np.std(new)) / math.sqrt(2 * len(old)))
-                key_change = _KeyChange(_plain(name, old), _plain(name, new), difference, sigma)
-                changes[name][key] = key_change
+                changes[name][key] = (_plain(name, old), _plain(name, new), difference, sigma)
     for name, change_of_key in changes.items():
         yield _verdict(name, change_of_key)
 
 
-class _KeyChange(NamedTuple):
-    """A figure of one key in both measurements."""
-
-    before: float
-    now: float
-    difference: float
-    sigma: float  # standard deviation by luck of one measurement
-
-
-def _verdict(name: str, change_of_key: Mapping[str, _KeyChange]) -> Verdict:
+def _verdict(name: str, change_of_key: Mapping[str, tuple[float, ...]]) -> Verdict:
     """Return the verdict of a figure over its keys."""
     old, new, difference, sigma = np.array(list(change_of_key.values())).T
     loss = difference if _is_cost(name) else -difference

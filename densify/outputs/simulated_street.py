@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Camera, Float, Float32, Int, Progress
+from densify.geometry.types import Float, Float32, Int, Progress
 from densify.outputs.atomic import staged_folder
 from densify.outputs.depth_png import encode_png
 from densify.readers import checks
@@ -35,9 +34,8 @@ _KITTI = (_DRIVE, *_CALIBRATION)
 _FOLDER = (NAME, "sweeps", "timestamps.txt", "poses.txt", "images", "truth")
 _POSE_STEP_NS = 5_000_000
 _MARGIN_NS = 150_000_000  # poses start this long before the first sweep and end after the last
-T_LEVEL_IMU = np.eye(4)  # the inertial unit is behind and below the scanner, slightly rotated
-T_LEVEL_IMU[:3, :3] = Rotation.from_rotvec([0.012, -0.003, -0.001]).as_matrix()
-T_LEVEL_IMU[:3, 3] = [-0.81, 0.32, -0.80]
+# The inertial unit is behind and below the scanner, slightly rotated.
+_T_LEVEL_IMU = poses.exp(np.array([0.012, -0.003, -0.001, -0.81, 0.32, -0.80]))
 _LATITUDE_DEG, _LONGITUDE_DEG, _ALTITUDE_M = 49.0, 8.4, 115.0
 _EARTH_RADIUS_M = 6_378_137.0
 _NUM_MOTIONS = 17  # velocities, accelerations and turn rates of an oxts record
@@ -203,26 +201,21 @@ def config_text(excerpt: Excerpt) -> str:
         "stamps_unit": "s",
         "scanner_origins": excerpt.street.simulator.sensor.origins_m.tolist(),
     }
-    cameras = {name: _camera_table(excerpt.street.cameras[name]) for name in excerpt.cameras}
-    config = {
-        "sweeps": sweeps,
-        "poses": {"file": "poses.txt", "stamps_unit": "s"},
-        "cameras": cameras,
-    }
+    cameras = {}
+    for name in excerpt.cameras:
+        camera = excerpt.street.cameras[name]
+        cameras[name] = {
+            **{"files": f"images/{name}", "stamps": "names", "stamps_unit": "ns"},
+            **{key: getattr(camera, key) for key in ("model", "max_angle_deg", "row_time_s")},
+            "size": [camera.width_px, camera.height_px],
+            "K": camera.K.tolist(),
+            "distortion": list(camera.distortion),
+            "T_cam_lidar": camera.T_cam_lidar.tolist(),
+        }
+    poses_file = {"file": "poses.txt", "stamps_unit": "s"}
+    config = {"sweeps": sweeps, "poses": poses_file, "cameras": cameras}
     text = yaml.safe_dump(config, sort_keys=False, default_flow_style=None, width=100)
     return f"# What the other files of this folder do not say.\n{text}"
-
-
-def _camera_table(camera: Camera) -> dict[str, Any]:
-    """Return the entry of a camera in densify.yaml."""
-    return {
-        **{"files": f"images/{camera.name}", "stamps": "names", "stamps_unit": "ns"},
-        **{key: getattr(camera, key) for key in ("model", "max_angle_deg", "row_time_s")},
-        "size": [camera.width_px, camera.height_px],
-        "K": camera.K.tolist(),
-        "distortion": list(camera.distortion),
-        "T_cam_lidar": camera.T_cam_lidar.tolist(),
-    }
 
 
 def _write_kitti(excerpt: Excerpt, folder: Path, progress: Progress) -> None:
@@ -294,7 +287,7 @@ def sweep_data(street: Street, frame: int, points: Float | Float32 | None = None
 
 def T_lidar_imu(tilt_deg: float) -> Float:
     """Return the (4,4) pose of the inertial unit in the frame of the tilted scanner."""
-    return poses.inverse(T_level_lidar(tilt_deg)) @ T_LEVEL_IMU
+    return poses.inverse(T_level_lidar(tilt_deg)) @ _T_LEVEL_IMU
 
 
 def oxts_line(street: Street, frame: int, first: int) -> str:

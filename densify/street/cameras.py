@@ -63,19 +63,18 @@ def _pinhole(name: str, row: Any) -> Camera:
     return Camera(name, width_px, height_px, K, T_cam_lidar, row_time_s=row_time_s)
 
 
-def _fisheye(row: Any) -> Camera:
-    """Return the fisheye camera, which looks to the left, with its centre in the middle."""
-    u, v = ((size - 1) / 2 for size in row.size_px)
-    K, T_cam_lidar = _intrinsics(row.focal_px, u, v), _pose(_LEFT, row.lidar_m)
-    width_px, height_px = row.size_px
-    return Camera(
-        "fisheye", width_px, height_px, K, T_cam_lidar, tuple(row.distortion),
-        model="fisheye", max_angle_deg=row.max_angle_deg,
-    )  # fmt: skip
-
-
 CAMERAS = {name: _pinhole(name, row) for name, row in vars(_TABLES.pinhole).items()}
-CAMERAS["fisheye"] = _fisheye(_FISHEYE)
+_WIDTH_PX, _HEIGHT_PX = _FISHEYE.size_px
+CAMERAS["fisheye"] = Camera(
+    "fisheye",
+    _WIDTH_PX,
+    _HEIGHT_PX,
+    _intrinsics(_FISHEYE.focal_px, (_WIDTH_PX - 1) / 2, (_HEIGHT_PX - 1) / 2),
+    _pose(_LEFT, _FISHEYE.lidar_m),
+    tuple(_FISHEYE.distortion),
+    model="fisheye",
+    max_angle_deg=_FISHEYE.max_angle_deg,
+)
 """The cameras by name; their poses are relative to a lidar on a level mount."""
 
 EXPOSURES: dict[str, Any] = {**vars(_TABLES.pinhole), "fisheye": _FISHEYE}
@@ -93,10 +92,8 @@ def T_level_lidar(tilt_deg: float) -> Float:
 def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str, Camera]:
     """Return name -> camera, which is level, with its pose relative to the tilted lidar."""
     T = T_level_lidar(tilt_deg)
-    cameras = {name: CAMERAS[name] for name in names}
     return {
-        name: replace(camera, T_cam_lidar=camera.T_cam_lidar @ T)
-        for name, camera in cameras.items()
+        name: replace(CAMERAS[name], T_cam_lidar=CAMERAS[name].T_cam_lidar @ T) for name in names
     }
 
 
@@ -127,10 +124,21 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
     # Pixels outside the view of the lens have no ray and stay black.
     in_view = np.flatnonzero(np.isfinite(ray[:, 0]))
     ray = ray[in_view]
-    cast = _in_world(ego, camera, ray, time_s, v[in_view] - (h - 1) / 2)
+    # Rays in the world at the exposure of their rows
+    exposed_s = time_s + (v[in_view] - (h - 1) / 2) * camera.row_time_s
+    poses = poses_at(ego, exposed_s)
+    T_ego_cam = T_ego_lidar() @ inverse(camera.T_cam_lidar)
+    origin = poses.apply(np.broadcast_to(T_ego_cam[:3, 3], ray.shape))
+    cast = Rays(origin, poses.turn(ray @ T_ego_cam[:3, :3].T), exposed_s)
     hits = world.cast(cast, lambda met: np.full(len(met.ray), STOPS))
     colour = _colours(world, cast, hits)
-    _shine_through_glass(colour, world, cast, hits)
+    # Glass shows the mirrored sky and the surface behind it.
+    is_glass = world.triangles.material[hits.triangle] == Material.GLASS
+    rows = np.flatnonzero((hits.triangle >= 0) & is_glass)
+    if len(rows):
+        through, glass = cast.rows(rows), _TABLES.light.glass
+        behind = _colours(world, through, world.cast(through, through_glass(world)))
+        colour[rows] = glass.mirrors * _sky(through.direction) + glass.passes * behind
 
     depth_m = hits.range_m * ray[:, 2] if camera.measure == "z" else hits.range_m
     is_near = np.isfinite(depth_m) & (depth_m <= _MAX_DEPTH_M)
@@ -141,26 +149,6 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
     body = np.full(h * w, -1, np.int32)
     body[in_view] = np.where(hits.triangle >= 0, world.triangles.body[hits.triangle], -1)
     return Picture(image.reshape(h, w, 3), depth.reshape(h, w), body.reshape(h, w))
-
-
-def _in_world(ego: Driving, camera: Camera, ray: Float, time_s: float, row: Float) -> Rays:
-    """Return rays in the world frame at the exposure of their rows, counted from the middle row."""
-    time = time_s + row * camera.row_time_s
-    poses = poses_at(ego, time)
-    T_ego_cam = T_ego_lidar() @ inverse(camera.T_cam_lidar)
-    origin = poses.apply(np.broadcast_to(T_ego_cam[:3, 3], ray.shape))
-    return Rays(origin, poses.turn(ray @ T_ego_cam[:3, :3].T), time)
-
-
-def _shine_through_glass(colour: Float, world: World, cast: Rays, hits: Hits) -> None:
-    """Replace the (N,3) colours of glass by the mirrored sky and the surface behind the glass."""
-    is_glass = world.triangles.material[hits.triangle] == Material.GLASS
-    rows = np.flatnonzero((hits.triangle >= 0) & is_glass)
-    if len(rows):
-        through = Rays(*(column[rows] for column in cast))
-        behind = _colours(world, through, world.cast(through, through_glass(world)))
-        shares = _TABLES.light.glass
-        colour[rows] = shares.mirrors * _sky(through.direction) + shares.passes * behind
 
 
 def through_glass(world: World) -> Optics:
@@ -243,9 +231,8 @@ def _painted(world: World, triangle: Int, barycentric: Float32) -> Float:
     brightness = np.ones(len(material))
     for name, texture in vars(_TABLES.textures).items():
         rows = np.flatnonzero(material == Material[name])
-        if len(rows):
-            pattern = _bricks if hasattr(texture, "brick_m") else _grains
-            brightness[rows] = pattern(position[rows], texture)
+        pattern = _bricks if hasattr(texture, "brick_m") else _grains
+        brightness[rows] = pattern(position[rows], texture)
     return COLOUR[material] * world.triangles.tint[triangle] * brightness[:, None]
 
 

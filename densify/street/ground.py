@@ -109,8 +109,8 @@ class Ground:
             lone = np.argmax(is_on_road[is_mixed] == lone_is_road, axis=1)
             # Corners in cyclic order, the lone corner first
             corner = np.take_along_axis(corner, (lone[:, None] + np.arange(3)) % 3, axis=1)
-            a, b, c = (xy[corner[:, i]] for i in range(3))
-            to_kerb_a, to_kerb_b, to_kerb_c = (distance[corner[:, i]][:, None] for i in range(3))
+            a, b, c = xy[corner.T]
+            to_kerb_a, to_kerb_b, to_kerb_c = distance[corner.T, None]
             # Points of the kerb on the sides a-b and a-c
             ab = a + (b - a) * to_kerb_a / (to_kerb_a - to_kerb_b)
             ac = a + (c - a) * to_kerb_a / (to_kerb_a - to_kerb_c)
@@ -205,24 +205,14 @@ def mark_road(ground: Ground, road: Road, row: Any, spans: Spans) -> Mesh:
         for begin, end in spans
         for station in np.arange(begin, end - _DASH_M, _DASH_EVERY_M)
     ]
-    lines: list[tuple[float, Spans]] = [(offset_m, dashes) for offset_m in row.dashed]
-    lines += [(offset_m, spans) for offset_m in row.solid]
-    width_m = getattr(row, "width_m", _LINE_M)
-    return Mesh.join(
-        [
-            _strip(ground, road.curve, offset_m, width_m, painted_spans)
-            for offset_m, painted_spans in lines
-        ]
-    )
-
-
-def _strip(ground: Ground, curve: Curve, offset_m: float, width_m: float, spans: Spans) -> Mesh:
-    """Return paint on the road: a band along the curve over spans of arc length."""
+    bands = [(offset_m, *dash) for offset_m in row.dashed for dash in dashes]
+    bands += [(offset_m, *span) for offset_m in row.solid for span in spans]
+    half_m = getattr(row, "width_m", _LINE_M) / 2
     meshes = []
-    for begin, end in spans:
+    for offset_m, begin, end in bands:
         stations = np.linspace(begin, end, max(2, int(end - begin) + 1))  # a metre apart
-        middle, normal = curve(stations), curve.normal(stations)
-        sides = (middle + normal * (offset_m + shift) for shift in (-width_m / 2, width_m / 2))
+        middle, normal = road.curve(stations), road.curve.normal(stations)
+        sides = (middle + normal * (offset_m + shift) for shift in (-half_m, half_m))
         right, left = (
             np.column_stack([side, ground.terrain.height(side) + _PAINT_M]) for side in sides
         )

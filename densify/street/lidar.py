@@ -19,7 +19,7 @@ from scipy.special import ndtr, ndtri
 from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, Float32, Int
 from densify.street import read_table
-from densify.street.mesh import REFLECTIVITY, Material, across, lengths, noise
+from densify.street.mesh import REFLECTIVITY, Material, lengths, noise
 from densify.street.motion import Driving, poses_at
 from densify.street.world import ABSORBED, PASSES, STOPS, Hits, Meeting, Optics, Rays, World
 
@@ -35,12 +35,9 @@ _S_PER_NS = 1e-9
 class Spinning:
     """A pattern that spins once a sweep, clockwise from above, forward at the reference time."""
 
-    # Elevations of the beams in firing order. Beams fire one after another, so every pulse has its
-    # own azimuth.
+    # Elevations of the beams, which fire one after another: every pulse has its own azimuth.
     elevation_deg: tuple[float, ...]
-    # Firings per second of each beam. A revolution at 20 Hz has half the columns of a revolution at
-    # 10 Hz.
-    columns_per_s: int
+    columns_per_s: int  # firings per second of each beam, at any rate of revolutions
     phase: float = 0.0  # lead in turns over a scanner that faces forward at the reference time
 
     def num_pulses(self, period_s: float) -> int:
@@ -75,7 +72,6 @@ class _Steady:
 class Raster(_Steady):
     """A scan pattern that covers a rectangle, line by line, by a fast and a slow mirror."""
 
-    # No two pulses of a sweep have the same elevation.
     width_deg: float  # width of the field of view, with its centre straight ahead
     height_deg: float  # height of the field of view
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
@@ -93,16 +89,14 @@ class Rosette(_Steady):
     """A scan pattern of two equal prisms: a rose that never repeats, as in Livox's scanners."""
 
     width_deg: float  # diameter of the round field of view
-    # Rotation rates of the two prisms. Petals are drawn at the difference of the rates and turn at
-    # their sum.
+    # Rates of the two prisms. Petals are drawn at their difference and turn at their sum.
     turns_per_s: tuple[float, float]
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
         """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
         first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
         axis_angle = np.radians(self.width_deg / 2) * np.cos(first - second)
-        roll = first + second
-        sine = np.sin(axis_angle)
+        roll, sine = first + second, np.sin(axis_angle)
         return np.stack([np.cos(axis_angle), sine * np.cos(roll), sine * np.sin(roll)], axis=1)
 
 
@@ -111,6 +105,8 @@ def _pointing(azimuth: Float, elevation: Float) -> Float:
     cosine = np.cos(elevation)
     return np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), np.sin(elevation)], axis=1)
 
+
+_PATTERNS: dict[str, Any] = {"spinning": Spinning, "raster": Raster, "rosette": Rosette}
 
 # Sensors
 
@@ -168,14 +164,12 @@ def _elevations_deg(row: Any) -> Float:
 def _scanner(row: Any) -> Scanner:
     """Return the scanner that a row of ``sensors`` in lidars.yaml describes."""
     columns = vars(row).copy()
-    if "spinning" in columns:
-        spinning = vars(columns.pop("spinning")).copy()
-        beams = getattr(_TABLES.elevation_deg, spinning.pop("elevation"))
-        elevation_deg = np.concatenate([_elevations_deg(beam) for beam in beams])
-        return Scanner(Spinning(tuple(elevation_deg.tolist()), **spinning), **columns)
-    if "raster" in columns:
-        return Scanner(Raster(**vars(columns.pop("raster"))), **columns)
-    return Scanner(Rosette(**vars(columns.pop("rosette"))), **columns)
+    make, name = next((make, name) for name, make in _PATTERNS.items() if name in columns)
+    pattern = vars(columns.pop(name)).copy()
+    if make is Spinning:
+        beams = getattr(_TABLES.elevation_deg, pattern.pop("elevation"))
+        pattern["elevation_deg"] = tuple(np.concatenate([*map(_elevations_deg, beams)]).tolist())
+    return Scanner(make(**pattern), **columns)
 
 
 SENSORS: dict[str, Sensor] = {
@@ -211,9 +205,10 @@ def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
 
 # Rays that pass a surface or are absorbed
 
-_VEHICLES = [Material[name] for name in vars(_TABLES.vehicles.lost_percent)]
-# True for materials that let some rays pass or absorb them
-_IS_LEAKY = np.isin(np.arange(len(Material)), (*_VEHICLES, Material.LEAF))
+# Vehicle part by material, -1 for materials of other things
+_VEHICLE_PART = np.full(len(Material), -1)
+for _part, _name in enumerate(vars(_TABLES.vehicles.lost_percent)):
+    _VEHICLE_PART[Material[_name]] = _part
 # Shares of rays without a return and of passing rays, by vehicle part, brightness and incidence
 _LOST, _PASSES = (
     0.01 * np.array([[*vars(paints).values()] for paints in vars(percent).values()])
@@ -232,43 +227,33 @@ def laser(world: World, luck: Float) -> Optics:
     surfaces = world.triangles
 
     def optics(met: Meeting) -> Int:
-        outcome = np.full(len(met.ray), STOPS)
-        rows = np.flatnonzero(_IS_LEAKY[surfaces.material[met.triangle]])
-        material, instance = (
-            column[met.triangle[rows]] for column in (surfaces.material, surfaces.instance)
-        )
+        material, instance = surfaces.material[met.triangle], surfaces.instance[met.triangle]
         # A ray that passed a surface of the same object before is inside it.
-        is_inside = (instance >= 0) & (instance == met.passed[rows])
+        is_inside = (instance >= 0) & (instance == met.passed)
         # Each layer draws anew: multiples of the golden ratio are spread evenly.
-        draw = (luck[met.ray[rows]] + met.layer * _GOLDEN) % 1.0
-        outcome[rows[(material == Material.LEAF) & (draw < _LEAF_PASSES)]] = PASSES
-        outcome[rows[(material == Material.GLASS) & is_inside]] = PASSES
-        is_shell = (material != Material.LEAF) & ~is_inside
-        _decide_at_shell(outcome, world, met, rows[is_shell])
+        draw = (luck[met.ray] + met.layer * _GOLDEN) % 1.0
+        is_open = (material == Material.LEAF) & (draw < _LEAF_PASSES)
+        is_open |= (material == Material.GLASS) & is_inside
+        outcome = np.where(is_open, PASSES, STOPS)
+
+        # The outside of vehicles
+        rows = np.flatnonzero((_VEHICLE_PART[material] >= 0) & ~is_inside)
+        part = _VEHICLE_PART[material[rows]]
+        tint = surfaces.mean_tint[met.triangle[rows]]
+        brightness = np.digitize(tint, _TABLES.vehicles.brightness)
+        cosine = np.clip(np.abs(met.facing[rows]), 0.0, 1.0)
+        incidence_deg = np.degrees(np.arccos(cosine))
+        absorbed_share, passing_share = (
+            _between(table[part, brightness], incidence_deg) for table in (_LOST, _PASSES)
+        )
+        # Whole patches of a surface pass or absorb rays. Each part of an object has its own.
+        owner = world.seed + 3 * instance[rows].astype(np.int64) + part
+        patch_draw = patches(met.position[rows], owner)
+        outcome[rows[patch_draw > 1 - passing_share]] = PASSES
+        outcome[rows[patch_draw < absorbed_share]] = ABSORBED
         return outcome
 
     return optics
-
-
-def _decide_at_shell(outcome: Int, world: World, met: Meeting, rows: Int) -> None:
-    """Enter PASSES and ABSORBED for the rays (indices in ``met``) at the outside of vehicles."""
-    surfaces = world.triangles
-    material, instance = (
-        column[met.triangle[rows]] for column in (surfaces.material, surfaces.instance)
-    )
-    vehicle_part = np.argmax(material[:, None] == np.array(_VEHICLES), axis=1)
-    tint = surfaces.mean_tint[met.triangle[rows]]
-    brightness = np.digitize(tint, _TABLES.vehicles.brightness)
-    cosine = np.clip(np.abs(met.facing[rows]), 0.0, 1.0)
-    incidence_deg = np.degrees(np.arccos(cosine))
-    absorbed_share, passing_share = (
-        _between(table[vehicle_part, brightness], incidence_deg) for table in (_LOST, _PASSES)
-    )
-    # Whole patches of a surface pass or absorb rays. Each part of an object has its own patches.
-    owner = world.seed + 3 * instance.astype(np.int64) + vehicle_part
-    draw = patches(met.positions(rows), owner)
-    outcome[rows[draw > 1 - passing_share]] = PASSES
-    outcome[rows[draw < absorbed_share]] = ABSORBED
 
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
@@ -278,8 +263,7 @@ def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
         np.interp(range_m, table.range_m, shares)
         for shares in (table.ground, table.dark, table.bright)
     )
-    is_vehicle = np.isin(material, _VEHICLES)
-    is_dark = (REFLECTIVITY[material] * tint < _DARK) & ~is_vehicle
+    is_dark = (REFLECTIVITY[material] * tint < _DARK) & (_VEHICLE_PART[material] < 0)
     return np.where(material <= Material.PAINT, ground, np.where(is_dark, dark, bright))
 
 
@@ -293,16 +277,11 @@ def patches(position: Float, owner: Int) -> Float:
     share = position / _PATCH_M - cell
     share = share * share * (3 - 2 * share)  # smoothstep: slope 0 at the sides of a cell
     i, j, k = cell.astype(np.int64).T
-    xo_key = i + _LARGE_PRIME * owner
-    yz_key = j + _LARGE_PRIME * k
-    hashed = noise(xo_key, yz_key)
-    # The corners of each cell are drawn once.
-    _, first, cell_of = np.unique(hashed, return_index=True, return_inverse=True)
+    xo_key, yz_key = i + _LARGE_PRIME * owner, j + _LARGE_PRIME * k
     corners = [
-        noise(xo_key[first] + x, yz_key[first] + y + _LARGE_PRIME * z)
-        for x, y, z in product((0, 1), repeat=3)
+        noise(xo_key + x, yz_key + y + _LARGE_PRIME * z) for x, y, z in product((0, 1), repeat=3)
     ]
-    normal = ndtri(np.clip(corners, _RARE, 1 - _RARE)).T.take(cell_of, axis=0).T
+    normal = ndtri(np.clip(corners, _RARE, 1 - _RARE))
     for axis_share in share.T:  # each axis halves the number of corners
         low, high = np.split(normal, 2)
         normal = low + axis_share * (high - low)
@@ -385,14 +364,11 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
     hits = world.cast(rays, laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD)
 
     # One echo for each pulse, and whether the receiver detects it
-    echoes = _strongest_echoes(hits, spot, rng)
-    range_m = echoes.range_m
-    triangle = hits.triangle[echoes.ray]
-    normal = hits.normal.take(echoes.ray, axis=0)
-    material = world.triangles.material[triangle]
-    tint = world.triangles.mean_tint[triangle]
+    range_m, ray, is_edge = _strongest_echoes(hits, spot, rng)
+    triangle = hits.triangle[ray]
+    material, tint = world.triangles.material[triangle], world.triangles.mean_tint[triangle]
     probability = 1 - share_lost(material, tint, range_m)
-    probability = probability * np.where(echoes.is_edge, _EDGE_HEARD, 1.0)
+    probability = probability * np.where(is_edge, _EDGE_HEARD, 1.0)
     keep = np.isfinite(range_m) & (rng.random(n) < probability)
 
     # Noise of the range, and points in the lidar frame
@@ -404,7 +380,7 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
 
     # Brightness
     reflectivity = REFLECTIVITY[material] * (_UNTINTED + (1 - _UNTINTED) * tint)
-    cosine = np.abs(np.einsum("ni,ni->n", normal, spot[:, 0]))
+    cosine = np.abs(np.einsum("ni,ni->n", hits.normal[ray], spot[:, 0]))
     brightness = reflectivity * (_GRAZING + (1 - _GRAZING) * cosine)
     brightness *= 1 + _NOISE * rng.normal(size=n)
     return Returns(
@@ -427,21 +403,17 @@ def _spot(direction: Float) -> Float:
     """Return (N,5,3) ray directions of N beams: spot centre, then four around it."""
     left = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
     left /= lengths(left)
-    upward = across(direction, left)
+    upward = np.cross(direction, left)
     rays = [direction + _SPOT_RAD * (a * left + b * upward) for a, b in _SPOT[1:]]
     return np.stack([direction, *(ray / lengths(ray) for ray in rays)], axis=1)
 
 
-class _Echoes(NamedTuple):
-    """The strongest echoes of N laser spots."""
+def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Int, Bool]:
+    """Return the strongest echo of each laser spot, from the hits of its (N,5,3) rays.
 
-    range_m: Float  # (N,) ranges, inf without a hit
-    ray: Int  # (N,) index of the ray whose surface counts
-    is_edge: Bool  # (N,) True for spots at an edge
-
-
-def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> _Echoes:
-    """Return the strongest echo of each laser spot, from the hits of its (N,5,3) rays."""
+    It is (N,) ranges, inf without a hit; (N,) indices of the rays whose surface counts; and a mask
+    (N,), True for spots at an edge.
+    """
     # On one plane the centre ray counts. At an edge each ray is equally likely to be the strongest
     # echo. Two echoes close together sometimes merge into one at a range in between.
     n, num = spot.shape[:2]
@@ -452,8 +424,7 @@ def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> _Ech
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
         plane_distance = np.abs(range_m - (range_m * slant)[:, :1] / slant)
     is_hit = np.isfinite(range_m)
-    is_flat = plane_distance < _FLAT_M
-    is_edge = np.logical_or.reduce([*is_hit.T]) & ~np.logical_and.reduce([*is_flat.T])
+    is_edge = is_hit.any(axis=1) & ~(plane_distance < _FLAT_M).all(axis=1)
 
     # One of the rays with a hit is chosen at random; a second ray may merge with it.
     edges = np.flatnonzero(is_edge)
@@ -468,4 +439,4 @@ def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> _Ech
     echo_m[edges] = chosen_m
     ray = np.arange(0, n * num, num)  # centre rays
     ray[edges] = edges * num + choice
-    return _Echoes(echo_m, ray, is_edge)
+    return echo_m, ray, is_edge

@@ -88,7 +88,7 @@ class Mesh:
 
         Texture x is along the first side. ``tint`` is (3,) for all quads or (K,3).
         """
-        num = len(corners)
+        corners, num = np.asarray(corners, float), len(corners)
         first_side = corners[:, 1] - corners[:, 0]
         last_side = corners[:, 3] - corners[:, 0]
         # Two perpendicular axes in the plane of each quad are the axes of its texture.
@@ -104,10 +104,6 @@ class Mesh:
             tint=np.repeat(np.broadcast_to(tint, (num, 3)), 2, axis=0),
             instance=np.full(2 * num, -1, np.int32),
         )
-
-    def moved(self, offset: Point) -> Mesh:
-        """Return the mesh moved by a (3,) offset in metres."""
-        return replace(self, vertices=self.vertices + offset)
 
     def posed(self, T_a_mesh: Float) -> Mesh:
         """Return the mesh in frame a, where ``T_a_mesh`` (4,4) is the pose of its present frame."""
@@ -175,9 +171,9 @@ def tube(
     # Two unit vectors u and v span the plane of the rings.
     axis = (b - a) / np.linalg.norm(b - a)
     is_upright = abs(axis[2]) >= _UPRIGHT
-    u = across(np.array([1.0, 0.0, 0.0] if is_upright else [0.0, 0.0, 1.0]), axis)
+    u = np.cross(np.array([1.0, 0.0, 0.0] if is_upright else [0.0, 0.0, 1.0]), axis)
     u /= np.linalg.norm(u)
-    v = across(axis, u)
+    v = np.cross(axis, u)
     angle = 2 * np.pi * np.arange(num_sides)[:, None] / num_sides
     ring = np.cos(angle) * u + np.sin(angle) * v
     start_ring, end_ring = a + start_radius_m * ring, b + end_radius_m * ring
@@ -209,20 +205,12 @@ def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint =
     # Unit vectors along the sides of each square
     u = rng.normal(size=(num, 3))
     u /= lengths(u)
-    v = across(u, rng.normal(size=(num, 3)))
+    v = np.cross(u, rng.normal(size=(num, 3)))
     v /= lengths(v)
     half = (size_m * rng.uniform(*_LEAF_SIZES, num))[:, None]
     corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     tints = np.asarray(tint) * rng.uniform(*_LEAF_TINTS, (num, 1))
     return Mesh.quads(np.stack(corners, axis=1), Material.LEAF, tints)
-
-
-def across(a: Float, b: Float) -> Float:
-    """Return the (...,3) cross products of vectors (...,3), faster than np.cross."""
-    product = np.empty(a.shape)
-    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        np.subtract(a[..., i] * b[..., j], a[..., j] * b[..., i], out=product[..., axis])
-    return product
 
 
 def lengths(vectors: Float) -> Float:

@@ -7,8 +7,8 @@ The origin of a vehicle mesh is on the ground midway between the axles, x forwar
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -17,24 +17,13 @@ import numpy as np
 
 from densify.geometry.types import Float
 from densify.street import read_table
-from densify.street.mesh import (
-    WHITE,
-    Material,
-    Mesh,
-    Tint,
-    ball,
-    box,
-    frustum,
-    leaves,
-    tube,
-)
-from densify.street.motion import DURATION_S, Driving, Limb, Towed
+from densify.street.mesh import WHITE, Material, Mesh, Tint, ball, box, frustum, leaves, tube
+from densify.street.motion import Driving, Limb, Towed
 from densify.street.world import Body
 
 _SHAPES = read_table("models")
 _MIRROR = np.array([1.0, -1.0, 1.0])
 WHEELBASE_M: dict[str, float] = vars(_SHAPES.wheelbase_m)
-SPAN_S = (-1.0, DURATION_S + 1.0)  # times with poses
 _CACHED_MODELS = 32
 
 
@@ -67,24 +56,20 @@ def _solid(row: Any, parameters: dict[str, Any]) -> Mesh:
     fields = {name: resolve(value, parameters) for name, value in vars(row).items()}
     material = fields["material"]
     fields["material"] = material if isinstance(material, Material) else Material[material]
-    make = _SOLIDS[fields.pop("solid")]
-    offsets = fields.pop("at", None)
+    make, offsets = _SOLIDS[fields.pop("solid")], fields.pop("at", None)
     if "spaced" in fields:
-        offsets = _repeated_offsets(fields.pop("spaced"), parameters)
+        spaced = fields.pop("spaced")
+        first, end = (resolve(end, parameters) for end in (spaced.first, spaced.end))
+        steps = np.arange(first, end, spaced.step_m)
+        gap_m = resolve(getattr(spaced, "from_middle_m", 0.0), parameters)
+        axis = np.eye(3)["xyz".index(spaced.axis)]
+        offsets = steps[np.abs(steps) >= gap_m, None] * axis
     if offsets is None:
         return make(**fields)
     if make is box:  # `box` makes many boxes at once
         return box(**fields | {end: np.add(fields[end], offsets) for end in ("low", "high")})
-    return Mesh.join([make(**fields).moved(offset) for offset in offsets])
-
-
-def _repeated_offsets(row: Any, parameters: dict[str, Any]) -> Float:
-    """Return the (N,3) offsets of solids that repeat along an axis."""
-    steps = np.arange(resolve(row.first, parameters), resolve(row.end, parameters), row.step_m)
-    gap_m = resolve(getattr(row, "from_middle_m", 0.0), parameters)
-    offsets = np.zeros((np.count_nonzero(np.abs(steps) >= gap_m), 3))
-    offsets[:, "xyz".index(row.axis)] = steps[np.abs(steps) >= gap_m]
-    return offsets
+    solid = make(**fields)
+    return Mesh.join([replace(solid, vertices=solid.vertices + offset) for offset in offsets])
 
 
 def resolve(value: Any, parameters: Mapping[str, Any]) -> Any:
@@ -99,7 +84,7 @@ def resolve(value: Any, parameters: Mapping[str, Any]) -> Any:
     return [resolve(item, parameters) for item in value]
 
 
-def _random_paint(rng: np.random.Generator) -> Tint:
+def random_paint(rng: np.random.Generator) -> Tint:
     """Return the colour of one of the paints."""
     return tuple(_SHAPES.paints[int(rng.integers(len(_SHAPES.paints)))])
 
@@ -129,22 +114,12 @@ def _sheet(left: Any, material: Material, tint: Tint = WHITE) -> Mesh:
     return Mesh.quads(_panels(line * _MIRROR, line), material, tint)
 
 
-def _quads(corners: Any, material: Material, tint: Tint = WHITE) -> Mesh:
-    """Return quads from lists of corners."""
-    return Mesh.quads(np.array(corners, float), material, tint)
-
-
 _SOLIDS: dict[str, Callable[..., Mesh]] = {
     "box": box, "frustum": frustum, "tube": tube, "ball": ball,
-    "sides": _sides, "sheet": _sheet, "quads": _quads,
+    "sides": _sides, "sheet": _sheet, "quads": Mesh.quads,
 }  # fmt: skip
 
 # Vehicles and people
-
-
-def parked_car(instance: int, rng: np.random.Generator) -> Mesh:
-    """Return the mesh of a car of random paint and shape, with this object number."""
-    return car_mesh(_random_paint(rng), rng).of_instance(instance)
 
 
 def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
@@ -154,9 +129,7 @@ def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
     front = shape.front_m + rng.uniform(*shape.longer_m)
     rear = shape.rear_m - rng.uniform(*shape.longer_m)
     roof = shape.roof_m + rng.uniform(*shape.estate_higher_m) * (style == "estate")
-    parameters = {"front": front, "rear": rear, "roof": roof, "paint": paint, "belt": shape.belt_m}
-    parameters |= {"wide": shape.half_width_m, "narrow": shape.roof_half_width_m}
-    parameters |= {"cowl": shape.cowl_m, "screen": shape.screen_m}
+    parameters = {**vars(shape.lengths), "front": front, "rear": rear, "roof": roof, "paint": paint}
     parameters["deck"] = rear + getattr(shape.deck_ahead_of_rear_m, style)
     parameters["rear_roof"] = rear + getattr(shape.rear_roof_ahead_of_rear_m, style)
     # Pillars behind and before the doors, at the lower and the upper line of the windows
@@ -171,14 +144,14 @@ def car_mesh(paint: Tint, rng: np.random.Generator) -> Mesh:
 
 def car(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a driving car of random paint and shape, with this object number."""
-    return Actor("car", (Body(car_mesh(_random_paint(rng), rng), motion, instance),))
+    return Actor("car", (Body(car_mesh(random_paint(rng), rng), motion, instance),))
 
 
 def truck(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a 16 m articulated truck whose trailer follows the tractor through turns."""
-    cab = model("truck_cab", paint=_random_paint(rng))
+    cab = model("truck_cab", paint=random_paint(rng))
     load = model("truck_load", tarpaulin=_random_cloth(rng))
-    towed = Towed(motion, _SHAPES.truck.kingpin_m, WHEELBASE_M["trailer"], *SPAN_S)
+    towed = Towed(motion, _SHAPES.truck.kingpin_m, WHEELBASE_M["trailer"])
     return Actor("truck", (Body(cab, motion, instance), Body(load, towed, instance)), num_solid=2)
 
 
@@ -189,44 +162,44 @@ def walker(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     parameters = {"hip": hip_m, "foot": -(hip_m - shape.leg_shorter_than_hip_m)}
     parameters |= {"cloth": _random_cloth(rng), "trousers": _random_cloth(rng)}
     parameters["hair"] = tuple(channel * rng.random() for channel in shape.darkest_hair)
-    trunk = Body(model("walker_trunk", **parameters), motion, instance)
-    return Actor("walker", (trunk, *_limbs(shape, parameters, motion, instance)))
+    trunk = model("walker_trunk", **parameters)
+    return _with_limbs("walker", trunk, parameters, motion, instance)
 
 
 def cyclist(motion: Driving, instance: int, rng: np.random.Generator) -> Actor:
     """Return a bicycle with a rider whose legs pedal."""
-    shape = _SHAPES.cyclist
     names = ("paint", "cloth", "helmet", "left_cloth", "right_cloth")
     parameters = {name: _random_cloth(rng) for name in names}
-    wheels = [part for x_m in shape.wheel.x_m for part in _spoked_wheel(shape.wheel, x_m)]
-    frame = Mesh.join([*wheels, model("bicycle_and_rider", **parameters)])
-    trunk = Body(frame, motion, instance)
-    return Actor("cyclist", (trunk, *_limbs(shape, parameters, motion, instance)))
+    wheels = [_spoked_wheel(x_m) for x_m in _SHAPES.cyclist.wheel.x_m]
+    trunk = Mesh.join([*wheels, model("bicycle_and_rider", **parameters)])
+    return _with_limbs("cyclist", trunk, parameters, motion, instance)
 
 
-def _limbs(
-    shape: Any, parameters: dict[str, Any], motion: Driving, instance: int
-) -> Iterator[Body]:
-    """Yield the limbs of a walker or cyclist."""
+def _with_limbs(
+    name: str, trunk: Mesh, parameters: dict[str, Any], motion: Driving, instance: int
+) -> Actor:
+    """Return a walker or cyclist with the limbs of its row in models.yaml."""
+    shape, bodies = getattr(_SHAPES, name), [Body(trunk, motion, instance)]
     for row in shape.limbs:
         hinge_m, phase = resolve(row.hinge_m, parameters), 2 * np.pi * row.phase
         limb = Limb(motion, hinge_m, row.swing_rad, shape.stride_m, phase)
-        yield Body(model(row.model, **parameters), limb, instance)
+        bodies.append(Body(model(row.model, **parameters), limb, instance))
+    return Actor(name, tuple(bodies))
 
 
-def _spoked_wheel(row: Any, x_m: float) -> list[Mesh]:
-    """Return the tubes of a wheel at a position along x: its tyre, and spokes across the hub."""
+def _spoked_wheel(x_m: float) -> Mesh:
+    """Return a wheel at a position along x: its tyre, and spokes across the hub."""
+    row = _SHAPES.cyclist.wheel
     angle = np.linspace(0, 2 * np.pi, row.num_sides + 1)
     circle = row.radius_m * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
     rim = circle + (x_m, 0, row.hub_m)
     half = row.num_sides // 2  # the opposite corner of the rim
     spokes = [(rim[i], rim[i + half]) for i in range(0, half, 2)]
-    tubes = [(row.tyre_m, Material.RUBBER, ends) for ends in pairwise(rim)]
-    tubes += [(row.spoke_m, Material.METAL, ends) for ends in spokes]
-    return [
-        tube(*ends, radius_m, material, num_sides=row.num_tube_sides)
-        for radius_m, material, ends in tubes
-    ]
+    sides = {"num_sides": row.num_tube_sides}
+    tyre = [tube(*ends, row.tyre_m, Material.RUBBER, **sides) for ends in pairwise(rim)]
+    return Mesh.join(
+        [*tyre, *(tube(*ends, row.spoke_m, Material.METAL, **sides) for ends in spokes)]
+    )
 
 
 # Houses and plants
@@ -263,8 +236,8 @@ def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
     radius_m = shape.trunk_radius.per_m * height + shape.trunk_radius.base_m
     top = (rng.uniform(*shape.top_m), rng.uniform(*shape.top_m), height * shape.top_share)
     root = (0, 0, shape.root_m)
-    trunk = tube(root, top, (radius_m, radius_m * shape.trunk_radius.top_share), Material.BARK)
-    meshes = [trunk]
+    radii_m = (radius_m, radius_m * shape.trunk_radius.top_share)
+    meshes = [tube(root, top, radii_m, Material.BARK)]
 
     # Branches start at the trunk, between the crown's lower end and its upper part.
     for _ in range(shape.num_branches):

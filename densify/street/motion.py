@@ -12,9 +12,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from densify.geometry.types import Bool, Float, Int
-from densify.street.mesh import Mesh, across, lengths
+from densify.street.mesh import Mesh, lengths
 
 DURATION_S = 16  # duration of every scene
+SPAN_S = (-1.0, DURATION_S + 1.0)  # times with poses
 STEP_M = 0.5  # distance between the points of a curve
 _FINE_M = 0.05  # step of the integration of a curve
 _TOW_S = 0.01  # time between the computed positions of a trailer
@@ -27,18 +28,13 @@ class Curve:
 
     def __init__(self, xy: Float) -> None:
         """Build the curve through (N,2) points in metres, neighbours about half a metre apart."""
-        # The sum of the chords is the arc length.
-        chord_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
-        self.length_m = float(chord_m[-1])
-        self.knots_m: Float = chord_m
-        self._spline = CubicSpline(chord_m, xy)
+        self.knots_m = _lengths_along(xy)
+        self.length_m = float(self.knots_m[-1])
+        self._spline = CubicSpline(self.knots_m, xy)
         self._slope = self._spline.derivative()
 
     def __call__(self, station_m: Float) -> Float:
         """Return the (N,2) points of the curve in metres at (N,) arc lengths in metres."""
-        inside = np.clip(station_m, 0.0, self.length_m)
-        if np.array_equal(inside, station_m):  # the tangent is not needed
-            return self._spline(inside)
         return self.with_tangent(station_m)[0]
 
     def with_tangent(self, station_m: Float) -> tuple[Float, Float]:
@@ -49,10 +45,8 @@ class Curve:
 
     def tangent(self, station_m: Float) -> Float:
         """Return (N,2) unit directions of travel at (N,) arc lengths."""
-        slope = self._slope(np.clip(station_m, 0.0, self.length_m))
-        squared = slope * slope  # faster than np.linalg.norm
-        unit: Float = slope / np.sqrt(squared[..., :1] + squared[..., 1:])
-        return unit
+        slope: Float = self._slope(np.clip(station_m, 0.0, self.length_m))
+        return slope / np.linalg.norm(slope, axis=-1, keepdims=True)
 
     def normal(self, station_m: Float) -> Float:
         """Return (N,2) unit vectors to the left of the direction of travel at (N,) arc lengths."""
@@ -100,28 +94,25 @@ class Lane:
         return float(np.interp(station_m, self._stations, self._abreast_m))
 
 
-def polyline(corners: Sequence[Float | tuple[float, float]], radius_m: float) -> Float:
+def polyline(corners: Sequence[Sequence[float] | Float], radius_m: float) -> Float:
     """Return (N,2) points, half a metre apart, along lines with corners rounded to ``radius_m``."""
-    pieces = [np.asarray(corners[0], float)[None]]
-    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
-        pieces.append(_rounded_corner(before, corner, after, radius_m))
-    pieces.append(np.asarray(corners[-1], float)[None])
-
+    points = np.asarray(corners, float)
+    corner_lines = zip(points[:-2], points[1:-1], points[2:], strict=True)
+    arcs = [_rounded_corner(a, b, c, radius_m) for a, b, c in corner_lines]
+    xy = np.concatenate([points[:1], *arcs, points[-1:]])
     # Resample the points at equal steps.
-    xy = np.concatenate(pieces)
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
-    even = np.linspace(0, length[-1], int(length[-1] / STEP_M) + 1)
-    return np.stack([np.interp(even, length, xy[:, axis]) for axis in range(2)], axis=1)
+    length_m = _lengths_along(xy)
+    even_m = np.linspace(0, length_m[-1], int(length_m[-1] / STEP_M) + 1)
+    return np.stack([np.interp(even_m, length_m, xy[:, axis]) for axis in range(2)], axis=1)
 
 
-def _rounded_corner(
-    before: Float | tuple[float, float],
-    corner: Float | tuple[float, float],
-    after: Float | tuple[float, float],
-    radius_m: float,
-) -> Float:
-    """Return points (N,2) of the arc that touches both lines at the middle of three corners."""
-    a, b, c = (np.asarray(point, float) for point in (before, corner, after))
+def _lengths_along(xy: Float) -> Float:
+    """Return the (N,) sums of the chords from the first of (N,2) points to each."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
+
+
+def _rounded_corner(a: Float, b: Float, c: Float, radius_m: float) -> Float:
+    """Return points (N,2) of the arc that touches the lines a-b and b-c."""
     u = (a - b) / np.linalg.norm(a - b)
     v = (c - b) / np.linalg.norm(c - b)
     half = np.arccos(np.clip(u @ v, -1, 1)) / 2  # half the angle between the lines
@@ -138,22 +129,18 @@ class Speed:
     """A speed profile: linear between knots (t_s, v_m_s), constant before and after."""
 
     def __init__(self, *knots: tuple[float, float]) -> None:
-        self._t, self._v = (np.array(column, float) for column in zip(*knots, strict=True))
+        self._t, self._v = np.array(knots, float).T
         steps = np.diff(self._t) * (self._v[1:] + self._v[:-1]) / 2
         self._travelled = np.concatenate([[0.0], np.cumsum(steps)])
+        # Constant acceleration between two knots, 0 after the last
+        self._acceleration = np.append(np.diff(self._v) / np.diff(self._t), 0.0)
 
     def distance(self, times_s: Float) -> Float:
         """Return the (N,) metres travelled since the first knot at (N,) seconds, below 0 before."""
-        last = len(self._t) - 1
-        before = np.clip(np.searchsorted(self._t, times_s, side="right") - 1, 0, last)
-        after = np.minimum(before + 1, last)
-        # Constant acceleration between two knots, 0 before the first and after the last
-        span = np.where(after > before, self._t[after] - self._t[before], 1.0)
-        acceleration = np.where(
-            times_s < self._t[0], 0.0, (self._v[after] - self._v[before]) / span
-        )
-        dt = times_s - self._t[before]
-        travelled: Float = self._travelled[before] + self._v[before] * dt + acceleration * dt**2 / 2
+        knot = np.maximum(np.searchsorted(self._t, times_s, side="right") - 1, 0)
+        acceleration = np.where(times_s < self._t[0], 0.0, self._acceleration[knot])
+        dt = times_s - self._t[knot]
+        travelled: Float = self._travelled[knot] + self._v[knot] * dt + acceleration * dt**2 / 2
         return travelled
 
 
@@ -207,11 +194,11 @@ class Poses(NamedTuple):
         """Return the poses at these indices."""
         return Poses(self.rotation[rows], self.position[rows])
 
-    def matrix(self, row: int = 0) -> Float:
-        """Return the (4,4) matrix ``T_world_body`` of one pose."""
-        T_world_body = np.eye(4)
-        T_world_body[:3, :3] = self.rotation[row]
-        T_world_body[:3, 3] = self.position[row]
+    def matrices(self) -> Float:
+        """Return the (N,4,4) matrices ``T_world_body``."""
+        T_world_body = np.tile(np.eye(4), (len(self.position), 1, 1))
+        T_world_body[:, :3, :3] = self.rotation
+        T_world_body[:, :3, 3] = self.position
         return T_world_body
 
 
@@ -234,11 +221,7 @@ def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
     is_new = np.diff(times_s, prepend=np.nan) != 0
     if is_new.all():
         return trajectory.poses(times_s)
-    poses = trajectory.poses(times_s[is_new])
-    if len(poses.position) == 1:
-        columns = (np.broadcast_to(column, (len(is_new), *column.shape[1:])) for column in poses)
-        return Poses(*columns)
-    return poses.rows(np.cumsum(is_new) - 1)
+    return trajectory.poses(times_s[is_new]).rows(np.cumsum(is_new) - 1)
 
 
 class Still:
@@ -296,29 +279,21 @@ def on_ground(
     forward = (front_xyz - rear_xyz) * (1.0, 1.0, not upright)
     # The axis to the left is perpendicular to the direction of travel and to the ground's normal.
     x = forward / lengths(forward)
-    y = across(np.column_stack([-slope, np.ones(len(slope))]), x)
+    y = np.cross(np.column_stack([-slope, np.ones(len(slope))]), x)
     y /= lengths(y)
-    return Poses(np.stack([x, y, across(x, y)], axis=2), middle)
+    return Poses(np.stack([x, y, np.cross(x, y)], axis=2), middle)
 
 
 class Towed:
     """The trajectory of a trailer, whose axle follows the tractor's kingpin (a tractrix)."""
 
-    def __init__(
-        self, tractor: Driving, kingpin_m: float, wheelbase_m: float, first_s: float, last_s: float
-    ) -> None:
-        """Compute the path of the axle.
+    def __init__(self, tractor: Driving, kingpin_m: float, wheelbase_m: float) -> None:
+        """Compute the path of the trailer's axle, ``wheelbase_m`` behind the kingpin.
 
-        Args:
-            tractor: Motion of the tractor.
-            kingpin_m: Position of the kingpin on the x axis of the tractor.
-            wheelbase_m: Distance from the kingpin to the axle of the trailer.
-            first_s: Begin of the computed path, in seconds since frame 0.
-            last_s: End of the path.
+        ``kingpin_m`` is the position of the kingpin on the x axis of the tractor.
         """
-        self._tractor = tractor
-        self._kingpin_m = kingpin_m
-        times = np.arange(first_s, last_s, _TOW_S)
+        self._tractor, self._kingpin_m = tractor, kingpin_m
+        times = np.arange(*SPAN_S, _TOW_S)
         pin = self._pin(times)
         axle = np.empty_like(pin)
         # The trailer starts straight behind the tractor. In each step the axle keeps its distance.

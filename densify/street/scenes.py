@@ -6,7 +6,7 @@ Time 0 is frame 0. The actors are around the ego vehicle at the meeting time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,12 +17,12 @@ from densify.geometry.types import Float
 from densify.street import models, motion, read_table
 from densify.street.ground import Ground, Road, Side, mark_road
 from densify.street.mesh import Material, Mesh
-from densify.street.models import SPAN_S, WHEELBASE_M, Actor, model, panel, resolve
-from densify.street.motion import Curve, Driving, Lane, Rectangles, Speed, left_of, upright
+from densify.street.models import WHEELBASE_M, Actor, model, panel, resolve
+from densify.street.motion import SPAN_S, Curve, Driving, Lane, Rectangles, Speed, left_of, upright
 from densify.street.world import Body, World
 
 _TABLES = read_table("scenes")
-FIRST_PARKED = 1000  # object number of the first parked car
+_FIRST_PARKED = 1000  # object number of the first parked car
 _NUM_SEEDS = 2**31  # number of possible seeds of the random properties of surfaces
 _TRIES = 40  # most random draws of an actor that collides
 _TOUCH_M = 25.0  # greatest distance of the centres of two objects that touch
@@ -49,11 +49,10 @@ class Scene:
 
 def build(preset: str, rng: np.random.Generator) -> Scene:
     """Return a random scene; ``preset`` is a key of `PRESETS`, and ``rng`` is advanced."""
-    table = PRESETS[preset]
-    has_traffic = preset != "static"
+    table, lay_roads = PRESETS[preset]
 
     # Roads, ground and static objects
-    curves, stations = _LAYOUTS[preset](table, rng)
+    curves, stations = lay_roads(table, rng)
     roads = {name: Road(curves[name], **vars(sides)) for name, sides in vars(table.roads).items()}
     terrain = motion.Terrain.hilly(rng, table.ground.max_slope, getattr(table.ground, "scale", 1.0))
     ground = Ground(terrain, tuple(roads.values()), table.ground.kerb_m, table.ground.pavement_m)
@@ -80,8 +79,9 @@ def build(preset: str, rng: np.random.Generator) -> Scene:
         stations["here"] = float(np.interp(ego_m, lane.curve.knots_m, curves["main"].knots_m))
 
     traffic = Traffic(ego, scenery, vars(table.lanes), curves)
-    for row in table.traffic if has_traffic else ():
-        traffic.add_row(Journey(**vars(row)), stations)
+    if preset != "static":
+        for row in table.traffic:
+            traffic.add_row(row, stations)
     static = Body(Mesh.join([*meshes, *scenery.meshes]), motion.Still())
     bodies = [static, *(body for actor in traffic.actors for body in actor.bodies)]
     footprints = Rectangles.joined(scenery.footprints)
@@ -142,9 +142,7 @@ def _turn(table: Any, main: Curve, side: Curve) -> tuple[Curve, float]:
     return curve, curve.length_m - straight_m - arc_m
 
 
-def _lay_crossing(
-    table: Any, rng: np.random.Generator
-) -> tuple[dict[str, Curve], dict[str, float]]:
+def _lay_crossing(table: Any, _: object) -> tuple[dict[str, Curve], dict[str, float]]:
     """Return the curves of the crossroads (straight roads and turning paths), and the stations."""
     curves = {
         name: Curve(motion.polyline(path.corners, getattr(path, "radius_m", 0.0)))
@@ -183,20 +181,37 @@ class Scenery:
         self.footprints: list[Rectangles] = []
         self._num_parked = 0
 
-    def put(self, mesh: Mesh, xy: Float, heading: float = 0.0, solid: Mesh | None = None) -> None:
+    def put(
+        self,
+        mesh: Mesh,
+        xy: Float,
+        heading: float = 0.0,
+        solid: Mesh | None = None,
+        kerb_gap_m: float | None = None,
+    ) -> bool:
         """Place a mesh on the ground at ``xy`` (2,), world, turned by a heading (rad) about z.
 
-        ``solid`` is the part of the mesh that traffic must not touch, None for the whole mesh.
+        Args:
+            solid: Part of the mesh that traffic must not touch, None for the whole mesh.
+            kerb_gap_m: Place it only if this part is 0.3 m from all objects and this far from the
+                kerb. None places it in any case.
+
+        Returns:
+            True if the mesh is placed.
         """
+        solid = solid or mesh
+        if kerb_gap_m is not None and not self._is_free(solid, xy, heading, kerb_gap_m):
+            return False
         z = float(self.ground.terrain.height(xy)) + self.ground.kerb_m
-        self._stand(mesh, upright((*xy, z), heading), solid or mesh)
+        self._stand(mesh, upright((*xy, z), heading), solid)
+        return True
 
     def _stand(self, mesh: Mesh, pose: motion.Poses, solid: Mesh) -> None:
         """Add a mesh at its pose, and the footprint of its solid part."""
-        self.meshes.append(mesh.posed(pose.matrix()))
+        self.meshes.append(mesh.posed(pose.matrices()[0]))
         self.footprints.append(Rectangles.of(solid, pose))
 
-    def is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
+    def _is_free(self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float) -> bool:
         """Return True if a mesh is 0.3 m from all objects, and ``kerb_gap_m`` from the kerb."""
         outline = Rectangles.of(mesh, upright((*xy, 0.0), heading), _CLEAR_M)
         if self.footprints:
@@ -209,40 +224,16 @@ class Scenery:
         tested = outline.centre + grid * outline.half_m[0] @ [forward, left_of(forward)]
         return float(self.ground.distance(tested).min()) >= kerb_gap_m
 
-    def put_if_free(
-        self, mesh: Mesh, xy: Float, heading: float, kerb_gap_m: float, solid: Mesh | None = None
-    ) -> None:
-        """Place a mesh as `put` does, but only if its solid part `is_free`."""
-        if self.is_free(solid or mesh, xy, heading, kerb_gap_m):
-            self.put(mesh, xy, heading, solid)
-
     def park(self, xy: Float, forward: Float) -> None:
         """Place a random parked car at ``xy`` (2,), world, along the direction ``forward`` (2,)."""
-        mesh = models.parked_car(FIRST_PARKED + self._num_parked, self.rng)
+        mesh = models.car_mesh(models.random_paint(self.rng), self.rng)
+        mesh = mesh.of_instance(_FIRST_PARKED + self._num_parked)
         self._num_parked += 1
         half = forward * WHEELBASE_M["car"] / 2
         pose = motion.on_ground(
             self.ground.terrain, (xy - half)[None], (xy + half)[None], np.zeros(1)
         )
         self._stand(mesh, pose, mesh)
-
-    def row(
-        self, make: Callable[[float], Mesh], start: Float, end: Float, kerb_gap_m: float
-    ) -> None:
-        """Place the panels of a fence, wall or hedge in a line, each on the ground below it.
-
-        Args:
-            make: Function that returns a panel of a given length (m).
-            start: (2,) begin of the line in metres, world.
-            end: (2,) end of the line.
-            kerb_gap_m: Least distance to the kerb. Panels nearer to it are left out.
-        """
-        length = float(np.linalg.norm(end - start))
-        num_panels = max(1, round(length / _TABLES.plots.panel_m))
-        heading = float(np.arctan2(*(end - start)[::-1]))
-        middles = start + (end - start) * (np.arange(num_panels)[:, None] + 0.5) / num_panels
-        for middle in middles[self.ground.distance(middles) > kerb_gap_m]:
-            self.put(make(length / num_panels), middle, heading)
 
 
 def _line_with_plots(
@@ -276,18 +267,15 @@ def _build_houses(scenery: Scenery, side: Side) -> None:
         depth = rng.uniform(*table.depth_m)
         home = models.house(rng, width - rng.uniform(*table.beside_house_m), depth)
         centre = side.at(middle, boundary + garden + depth / 2)
-        is_built = scenery.is_free(
-            home, centre, heading, pavement_m + table.house_beyond_pavement_m
-        )
-        if is_built:
-            scenery.put(home, centre, heading)
+        house_gap_m = pavement_m + table.house_beyond_pavement_m
+        is_built = scenery.put(home, centre, heading, kerb_gap_m=house_gap_m)
         # A plot without a house always has a tree.
         if rng.random() < (table.tree.share if is_built else 1.0):
             tree, foot = models.tree(rng)
             inset_m = table.tree.from_ends_m
             tree_station = station + rng.uniform(inset_m, width - inset_m)
             xy = side.at(tree_station, boundary + rng.uniform(*table.tree.behind_boundary_m))
-            scenery.put_if_free(tree, xy, 0.0, pavement_m, foot)
+            scenery.put(tree, xy, 0.0, foot, pavement_m)
         _close_off(scenery, side, (station, station + width), boundary, has_gate=is_built)
         station += width
 
@@ -315,15 +303,15 @@ def _close_off(
     middle, half_m = (begin + end) / 2, table.gate_half_m
     spans = [(begin, middle - half_m), (middle + half_m, end)] if has_gate else [span]
     for first_station, last_station in spans:
-        start, stop = side.at(first_station, beyond_m), side.at(last_station, beyond_m)
-        scenery.row(make, start, stop, beyond_m - table.fence_clear_m)
-
-
-def _make_furniture(kind: str, rng: np.random.Generator) -> tuple[Mesh, Mesh | None]:
-    """Return an object for the kerb, and its part that is tested for collisions, None for all."""
-    if kind == "tree":
-        return models.tree(rng)
-    return (models.sign_post(rng) if kind == "sign_post" else model(kind)), None
+        # Panels in a straight line, each on the ground below it
+        start = side.at(first_station, beyond_m)
+        line = side.at(last_station, beyond_m) - start
+        length_m, heading = float(np.linalg.norm(line)), float(np.arctan2(line[1], line[0]))
+        num_panels = max(1, round(length_m / table.panel_m))
+        middles = start + line * (np.arange(num_panels)[:, None] + 0.5) / num_panels
+        is_clear = scenery.ground.distance(middles) > beyond_m - table.fence_clear_m
+        for middle in middles[is_clear]:
+            scenery.put(make(length_m / num_panels), middle, heading)
 
 
 def _furnish(scenery: Scenery, side: Side, spacing_m: float, has_trees: bool) -> None:
@@ -336,13 +324,18 @@ def _furnish(scenery: Scenery, side: Side, spacing_m: float, has_trees: bool) ->
                 continue
             if hasattr(row, "share") and rng.random() >= row.share:
                 continue
-            mesh, solid = _make_furniture(row.kind, rng)
             ahead_m = row.ahead_m if hasattr(row, "ahead_m") else row.ahead_share * spacing_m
-            heading = 0.0 if row.kind == "tree" else side.heading(station)
-            if row.kind == "sign_post" and side.side > 0:
-                heading += np.pi  # signs face the traffic
+            heading, solid = side.heading(station), None
+            if row.kind == "tree":
+                mesh, solid = models.tree(rng)
+                heading = 0.0
+            elif row.kind == "sign_post":
+                mesh = models.sign_post(rng)
+                heading += np.pi * (side.side > 0)  # signs face the traffic
+            else:
+                mesh = model(row.kind)
             xy = side.at(station + ahead_m, row.beyond_kerb_m)
-            scenery.put_if_free(mesh, xy, heading, row.clear_of_kerb_m, solid)
+            scenery.put(mesh, xy, heading, solid, row.clear_of_kerb_m)
 
 
 def _park_cars(
@@ -403,70 +396,43 @@ def _line_motorway(scenery: Scenery, road: Road, end_m: float) -> None:
 # Traffic
 
 
-@dataclass(frozen=True)
-class Journey:
-    """The path and speed of an actor or a convoy: a row of ``traffic`` in scenes.yaml."""
-
-    kind: str  # kind of the actor: "car", "truck", "cyclist" or "walker"
-    lane: str  # name of its lane
-    # Position at the meeting time: arc length (m) along the road, the name of a station, or a pair
-    # [name, metres ahead], as `densify.street.models.resolve` reads it
-    station: Any
-    slack_m: float = 2.0  # greatest random distance from the station
-    knots: Sequence[tuple[float, float]] = ()  # knots (s, m/s) of the speed over time
-    # Without knots: constant speed in m/s, or a range [lowest, highest] from which each try draws
-    m_s: Any = 0.0
-    vary: float = 0.0  # share by which the constant speed varies at random
-    vary_m_s: float = 0.0  # m/s by which the constant speed varies in each try
-    gap_m: float | None = None  # distance between the vehicles of a convoy, None for a single actor
-
-
 class Traffic:
     """Collector of ``actors`` that collide neither with each other nor with static objects."""
 
     def __init__(
         self, ego: Driving, scenery: Scenery, lanes: Mapping[str, Any], curves: Mapping[str, Curve]
     ) -> None:
-        """Start without actors.
-
-        Args:
-            scenery: Static objects, which actors must not touch.
-            lanes: Rows of ``lanes`` in scenes.yaml, by name.
-            curves: Curves of the roads, by name.
-        """
+        """Start without actors; ``lanes`` are rows of scenes.yaml and ``curves`` roads, by name."""
         self.actors: list[Actor] = []
-        self._ground = scenery.ground
-        self._rng = scenery.rng
-        self._lanes = lanes
-        self._curves = curves
+        self._ground, self._rng = scenery.ground, scenery.rng
+        self._lanes, self._curves = lanes, curves
         self._times = np.arange(*SPAN_S, _OUTLINE_STEP_S)
         self._static = Rectangles.joined(scenery.footprints)
         outline = Rectangles.of(model("ego_vehicle"), ego.poses(self._times), _EGO_MARGIN_M)
         self._moving = outline.rows(None)
 
-    def add_row(self, journey: Journey, stations: Mapping[str, float]) -> None:
-        """Add a journey's actor or convoy, if it fits; ``stations`` are arc lengths (m) by name."""
-        station = resolve(journey.station, stations)
-        if journey.gap_m is None:
-            self._add(partial(self._draw, journey, station, self._speed(journey)))
-        else:
-            for number in _CONVOY:
-                ahead_m = number * (journey.gap_m * _vary(self._rng, _CONVOY_VARIES))
-                self._add(partial(self._draw, journey, station + ahead_m, self._speed(journey)))
+    def add_row(self, row: Any, stations: Mapping[str, float]) -> None:
+        """Add the actor or convoy of a row of ``traffic`` in scenes.yaml.
 
-    def _speed(self, journey: Journey) -> Speed | None:
-        """Return the speed of a journey, None if it is drawn in each try."""
-        if journey.knots:
-            return Speed(*journey.knots)
-        if journey.vary_m_s or isinstance(journey.m_s, list):
-            return None
-        factor = _vary(self._rng, journey.vary) if journey.vary else 1.0
-        return Speed((0.0, journey.m_s * factor))
+        ``stations`` are arc lengths (m) by name. Actors that fit nowhere are left out.
+        """
+        station = resolve(row.station, stations)
+        if not hasattr(row, "gap_m"):
+            self._add(row, station)
+            return
+        for number in _CONVOY:
+            self._add(row, station + number * (row.gap_m * _vary(self._rng, _CONVOY_VARIES)))
 
-    def _add(self, draw: Callable[[], Actor]) -> None:
-        """Add an actor, drawn again until it fits, or none if every random draw collides."""
+    def _add(self, row: Any, station: float) -> None:
+        """Add an actor near a station, drawn again until it fits."""
+        speed = None  # None: each try draws another
+        if hasattr(row, "knots"):
+            speed = Speed(*row.knots)
+        elif not (hasattr(row, "vary_m_s") or isinstance(row.m_s, list)):
+            factor = _vary(self._rng, row.vary) if hasattr(row, "vary") else 1.0
+            speed = Speed((0.0, row.m_s * factor))
         for _ in range(_TRIES):
-            actor = draw()
+            actor = self._draw(row, station, speed)
             has_limbs = len(actor.bodies) > actor.num_solid
             margin_m = _LIMBS_MARGIN_M if has_limbs else _ACTOR_MARGIN_M
             outlines = [
@@ -489,45 +455,38 @@ class Traffic:
         near = self._static.rows(static_row)
         return bool(motion.overlap(outline.rows(time_row), near).any())
 
-    def _draw(self, journey: Journey, station: float, speed: Speed | None) -> Actor:
+    def _draw(self, row: Any, station: float, speed: Speed | None) -> Actor:
         """Draw an actor beside a station of the road at the meeting time."""
-        row, rng, ground = self._lanes[journey.lane], self._rng, self._ground
-        has_range, is_walker = isinstance(row.offset_m, list), journey.kind == "walker"
-        offset_m = rng.uniform(*row.offset_m) if has_range else row.offset_m
-        lane = Lane(self._curves[row.road], offset_m, getattr(row, "forward", True))
-        arc_m = lane.at(station + rng.uniform(-journey.slack_m, journey.slack_m))
+        along, rng, ground = self._lanes[row.lane], self._rng, self._ground
+        has_range, is_walker = isinstance(along.offset_m, list), row.kind == "walker"
+        offset_m = rng.uniform(*along.offset_m) if has_range else along.offset_m
+        lane = Lane(self._curves[along.road], offset_m, getattr(along, "forward", True))
+        arc_m = lane.at(station + rng.uniform(-row.slack_m, row.slack_m))
 
         def lift(arc_m: Float) -> Float:
             """Return the (N,) heights above the terrain at (N,) arc lengths: 0 to the kerb's."""
             beyond_m = ground.distance(lane.curve(arc_m))
             return ground.kerb_m * np.clip(beyond_m / _KERB_RAMP_M, 0, 1)
 
-        if journey.vary_m_s:
-            m_s = journey.m_s + rng.uniform(-journey.vary_m_s, journey.vary_m_s)
+        if speed is None:
+            if isinstance(row.m_s, list):
+                m_s = rng.uniform(*row.m_s)
+            else:
+                m_s = row.m_s + rng.uniform(-row.vary_m_s, row.vary_m_s)
             speed = Speed((0.0, m_s))
         driving = Driving(
-            lane.curve, speed or Speed((0.0, rng.uniform(*journey.m_s))), arc_m,
-            _TABLES.meeting_s, ground.terrain, WHEELBASE_M[journey.kind],
+            lane.curve, speed, arc_m, _TABLES.meeting_s, ground.terrain, WHEELBASE_M[row.kind],
             lift if is_walker else None, upright=is_walker,
         )  # fmt: skip
-        return _MAKERS[journey.kind](driving, len(self.actors), rng)
+        # The kind is the name of a function: car, truck, cyclist or walker.
+        actor: Actor = getattr(models, row.kind)(driving, len(self.actors), rng)
+        return actor
 
 
 PRESETS = {
-    "street": _TABLES.street,
-    "static": _TABLES.street,  # only the ego vehicle moves
-    "crossing": _TABLES.crossing,
-    "highway": _TABLES.highway,
+    "street": (_TABLES.street, _lay_street),
+    "static": (_TABLES.street, _lay_street),  # only the ego vehicle moves
+    "crossing": (_TABLES.crossing, _lay_crossing),
+    "highway": (_TABLES.highway, _lay_highway),
 }
-_LAYOUTS = {
-    "street": _lay_street,
-    "static": _lay_street,
-    "crossing": _lay_crossing,
-    "highway": _lay_highway,
-}
-_MAKERS = {
-    "car": models.car,
-    "truck": models.truck,
-    "cyclist": models.cyclist,
-    "walker": models.walker,
-}
+"""Name of the preset -> row of scenes.yaml, and function that returns its curves and stations."""

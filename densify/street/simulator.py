@@ -15,7 +15,7 @@ from densify.geometry.poses import transform
 from densify.geometry.types import Bool, Float, SweepTruth
 from densify.street.cameras import CAMERAS, EXPOSURES, Picture, expose
 from densify.street.lidar import Mount, Returns, Sensor, T_ego_lidar, at_offsets, scan
-from densify.street.motion import DURATION_S
+from densify.street.motion import DURATION_S, Poses
 from densify.street.scenes import Scene, build
 from densify.street.world import Body
 
@@ -42,8 +42,7 @@ class Bodies:
             points: (N,3) metres, each in the frame of its body.
         """
         T_world_body = self.T_world_body[frame][body]
-        placed: Float = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], points)
-        return placed + T_world_body[:, :3, 3]
+        return Poses(T_world_body[:, :3, :3], T_world_body[:, :3, 3]).apply(points)
 
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
@@ -51,9 +50,8 @@ class Bodies:
         """Return the truth of a sweep's points, as in `place`, of the objects ``instance`` (N,)."""
         T_world_lidar = self.T_world_lidar[frame]
         from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
-        return SweepTruth(
-            T_world_lidar, from_lidar @ T_world_lidar[:3, :3], instance, self.moving[frame][body]
-        )
+        points_lidar = from_lidar @ T_world_lidar[:3, :3]
+        return SweepTruth(T_world_lidar, points_lidar, instance, self.moving[frame][body])
 
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
@@ -136,7 +134,7 @@ class Simulator:
 
     def T_world_lidar_at(self, time_ns: int) -> Float:
         """Return the (4,4) pose of the lidar frame in the world at a time in ns since 1970."""
-        T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrix()
+        T_world_ego = self.scene.ego.poses(np.array([seconds(time_ns)])).matrices()[0]
         return T_world_ego @ T_ego_lidar(self.tilt_deg)
 
     @cached_property
@@ -153,16 +151,9 @@ class Simulator:
         bodies = self.scene.world.bodies
         if indices is not None:
             bodies = tuple(bodies[index] for index in indices)
-        T_world_body = np.tile(np.eye(4), (len(times), len(bodies), 1, 1))
-        for index, body in enumerate(bodies):
-            poses = body.trajectory.poses(times)
-            T_world_body[:, index, :3, :3] = poses.rotation
-            T_world_body[:, index, :3, 3] = poses.position
-        return Bodies(
-            np.stack([self.T_world_lidar_at(stamp) for stamp in stamps_ns]),
-            T_world_body,
-            _moving(bodies, times),
-        )
+        T_world_lidar = np.stack([self.T_world_lidar_at(stamp) for stamp in stamps_ns])
+        T_by_body = [body.trajectory.poses(times).matrices() for body in bodies]
+        return Bodies(T_world_lidar, np.stack(T_by_body, axis=1), _moving(bodies, times))
 
     def in_bodies(self, frame: int, returns: Returns) -> Float:
         """Return the (N,3) measured points, each in the frame of the body that the ray hit."""
@@ -184,15 +175,11 @@ def seconds(time_ns: int) -> float:
 
 def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
     """Return (F,B) True if the body is part of an object that moves around that time."""
-
-    def positions(shift_s: float) -> Float:
-        columns = [body.trajectory.poses(times_s + shift_s).position for body in bodies]
-        return np.stack(columns, axis=1)
-
-    now = positions(0.0)
-    shifts_s = _MOVING_S * np.array([-1, -0.5, 0.5, 1])
-    moved_m = [np.linalg.norm(positions(shift_s) - now, axis=2) for shift_s in shifts_s]
-    moving: Bool = np.max(moved_m, axis=0) >= _MOVING_M
+    times = times_s[:, None] + _MOVING_S * np.array([0, -1, -0.5, 0.5, 1])
+    columns = [body.trajectory.poses(times.ravel()).position for body in bodies]
+    position = np.stack(columns, axis=1).reshape(*times.shape, len(bodies), 3)
+    moved_m = np.linalg.norm(position[:, 1:] - position[:, :1], axis=3).max(axis=1)
+    moving: Bool = moved_m >= _MOVING_M
     # An object moves if one of its bodies moves.
     instance = np.array([body.instance for body in bodies])
     for number in np.unique(instance[instance >= 0]):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, NamedTuple
@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from densify.geometry.types import Bool, Float, Float32, Int
-from densify.street.mesh import Mesh, across, lengths
-from densify.street.motion import Poses, Trajectory, poses_at
+from densify.street.mesh import Mesh, lengths
+from densify.street.motion import Trajectory, poses_at
 
 _STEP_M = 2e-3  # distance from a surface that a ray passes to its next origin
 _MAX_LAYERS = 8  # most layers of glass and leaves that one ray passes
 _STEP_S = 0.05  # time between the sampled positions of a body
 _SLACK_M = 0.1  # addition to the radius of the ball around these positions
 _BLOCK = 16  # consecutive rays that are tested together
-_TINY = 1e-9
 _FLAT_M2 = 1e-7  # twice the area of a triangle that is left out
 
 
@@ -41,6 +40,10 @@ class Rays(NamedTuple):
     direction: Float  # (N,3) unit vectors, world
     time_s: Float  # (N,) seconds since frame 0
 
+    def rows(self, rows: Int | slice) -> Rays:
+        """Return the rays at these indices."""
+        return Rays(*(column[rows] for column in self))
+
 
 class Hits(NamedTuple):
     """The hits of N rays."""
@@ -58,16 +61,10 @@ class Meeting(NamedTuple):
     ray: Int  # (K,) ray indices
     triangle: Int  # (K,) triangle indices
     layer: int  # number of surfaces that the rays have passed before
-    origin: Float  # (K,3) origins of the rays in the frame of the body
-    direction: Float  # (K,3) unit vectors in the frame of the body
-    distance_m: Float  # (K,) distances from the origins
-    facing: Float  # (K,) inner products of directions and normals
+    position: Float  # (K,3) points where the rays meet it, metres, frame of the body
+    facing: Float  # (K,) inner products of ray directions and normals
     # (K,) object number of the previous surface that the ray passed, -1 for none
     passed: NDArray[np.int32]
-
-    def positions(self, rows: Int) -> Float:
-        """Return the (R,3) points, metres, frame of the body, where some rays (R,) meet it."""
-        return self.origin[rows] + self.distance_m[rows, None] * self.direction[rows]
 
 
 STOPS, PASSES, ABSORBED = range(3)
@@ -86,9 +83,9 @@ class Triangles:
         ]
         mesh = Mesh.join(meshes)
         # Embree computes in single precision; the planes are those of its rounded corners.
-        single = mesh.vertices.astype(np.float32).take(mesh.triangles, axis=0)
+        single = mesh.vertices.astype(np.float32)[mesh.triangles]
         corners = single.astype(np.float64)
-        normal = across(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = lengths(normal)
         keep = np.flatnonzero(length[:, 0] > _FLAT_M2)
         counts = [len(body_mesh.triangles) for body_mesh in meshes]
@@ -96,43 +93,32 @@ class Triangles:
         # Index of the first triangle of each body
         self.first: Int = np.searchsorted(self.body, np.arange(len(meshes) + 1))
         self.material = mesh.material[keep].astype(np.int64)
-        self.tint: Float = mesh.tint.take(keep, axis=0)
+        self.tint: Float = mesh.tint[keep]
         self.mean_tint: Float = self.tint.mean(axis=1)
-        self.uv: Float = mesh.uv.take(mesh.triangles.take(keep, axis=0), axis=0)
+        self.uv: Float = mesh.uv[mesh.triangles[keep]]
         self.instance = mesh.instance[keep]
-        self.corner: Float = corners[:, 0].take(keep, axis=0)
-        self.normal: Float = normal.take(keep, axis=0) / length.take(keep, axis=0)
-        corners_by_body = np.split(single.take(keep, axis=0), self.first[1:-1])
+        self.corner: Float = corners[keep, 0]
+        self.normal: Float = normal[keep] / length[keep]
         # Embree scene of each body, in single precision
-        self.scenes = [_raycasting_scene(body_corners) for body_corners in corners_by_body]
+        self.scenes = [*map(_embree_scene, np.split(single[keep], self.first[1:-1]))]
 
-    def first_hit(
-        self, spans: Iterable[tuple[int, int]], origin: Float, direction: Float
-    ) -> tuple[Int, Int, Float]:
-        """Return rays (K,) with a hit on their body, their first triangles (K,), and u and v (K,2).
 
-        Args:
-            spans: Index of each body, and the end of its rays in the arrays below, ascending.
-            origin: (N,3) origins in metres, in the frame of the body.
-            direction: (N,3) unit vectors in that frame.
-        """
-        start = origin.astype(np.float32)
-        ray = direction.astype(np.float32)
-        met, triangle, barycentric = [], [], []
-        begin = 0
-        for index, end in spans:
-            if end > begin:
-                traced = self.scenes[index].run(
-                    start[begin:end], ray[begin:end], query="INTERSECT", output=True
-                )
-                rows = np.flatnonzero(traced["primID"] >= 0)
-                met.append(rows + begin)
-                triangle.append(traced["primID"][rows] + self.first[index])
-                barycentric.append(np.stack([traced["u"][rows], traced["v"][rows]], axis=1))
-            begin = end
-        if not met:
-            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
-        return np.concatenate(met), np.concatenate(triangle), np.concatenate(barycentric)
+@cache
+def _embree_device() -> Any:
+    """Return the one Embree device of all scenes: after a thousand devices Embree fails."""
+    from embreex.rtcore import EmbreeDevice
+
+    return EmbreeDevice()
+
+
+def _embree_scene(corners: Float32) -> Any:
+    """Return the Embree scene of (T,3,3) triangle corners."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene(_embree_device())
+    TriangleMesh(scene, corners)
+    return scene
 
 
 class World:
@@ -157,79 +143,49 @@ class World:
         """
         # The static world first; then the moving bodies in front of its surfaces
         every = np.arange(len(rays.time_s))
-        best = self._cast_bodies([(0, len(every))], rays.origin, rays.direction, every, optics)
-        groups = Rays(*(column[::num_together] for column in rays))
-        farthest_m = np.maximum.reduce([*best.range_m.reshape(-1, num_together).T])
-        candidates = [
-            _Candidate(index, rows, poses_at(self.bodies[index].trajectory, groups.time_s[rows]))
-            for index, rows in self._find_near_rays(groups, farthest_m, spread)
-        ]
-        if candidates:
-            self._add_moving(best, rays, candidates, optics, num_together)
-        best.range_m[best.absorbed] = np.inf
-        return best
-
-    def _add_moving(
-        self,
-        best: Hits,
-        rays: Rays,
-        candidates: Sequence[_Candidate],
-        optics: Optics,
-        num: int,
-    ) -> None:
-        """Enter the hits of moving bodies that are nearer than those in ``best``."""
-        # All rays that may hit a body, body by body, in the frame of their body
-        groups = np.concatenate([candidate.groups for candidate in candidates])
-        ends = num * np.cumsum([len(candidate.groups) for candidate in candidates])
-        bodies = [candidate.body for candidate in candidates]
-        spans = list(zip(bodies, ends.tolist(), strict=True))
-        all_poses = [candidate.poses for candidate in candidates]
-        poses = Poses(*(np.concatenate(columns) for columns in zip(*all_poses, strict=True)))
-        rows = (groups[:, None] * num + np.arange(num)).ravel()
-        origin = poses.undo(rays.origin.take(groups * num, axis=0)).repeat(num, axis=0)
-        direction = rays.direction.take(rows, axis=0).reshape(-1, num, 3) @ poses.rotation
-        hits = self._cast_bodies(spans, origin, direction.reshape(-1, 3), rows, optics)
-
-        # The bodies in turn: a ray may hit several of them.
-        begin = 0
-        for body_poses, (_, end) in zip(all_poses, spans, strict=True):
-            nearer = np.flatnonzero(hits.range_m[begin:end] < best.range_m[rows[begin:end]])
-            normal = hits.normal[begin + nearer]
-            hits.normal[begin + nearer] = body_poses.rows(nearer // num).turn(normal)
-            nearer += begin
+        best = self._cast_at_body(0, rays.origin, rays.direction, every, optics)
+        groups = rays.rows(np.s_[::num_together])
+        farthest_m = best.range_m.reshape(-1, num_together).max(axis=1)
+        for index, near in self._find_near_rays(groups, farthest_m, spread):
+            # Cast these rays in the frame of the body.
+            body_poses = poses_at(self.bodies[index].trajectory, groups.time_s[near])
+            rows = (near[:, None] * num_together + np.arange(num_together)).ravel()
+            origin = body_poses.undo(groups.origin[near]).repeat(num_together, axis=0)
+            direction = rays.direction[rows].reshape(-1, num_together, 3) @ body_poses.rotation
+            hits = self._cast_at_body(index, origin, direction.reshape(-1, 3), rows, optics)
+            nearer = np.flatnonzero(hits.range_m < best.range_m[rows])
+            hit_poses = body_poses.rows(nearer // num_together)
+            hits.normal[nearer] = hit_poses.turn(hits.normal[nearer])
             for name in Hits._fields:
                 getattr(best, name)[rows[nearer]] = getattr(hits, name)[nearer]
-            begin = end
+        best.range_m[best.absorbed] = np.inf
+        return best
 
     def _find_near_rays(
         self, rays: Rays, farthest_m: Float, spread: float
     ) -> Iterator[tuple[int, Int]]:
-        """Yield the index of each body but the first, and indices of rays that may hit it."""
-        # These rays intersect a ball around the positions of the body at all of their times, before
+        """Yield the index of each moving body that rays may hit, and the indices of these rays."""
+        # These rays meet a ball around the positions of the body at all of their times, before
         # their static surface. Blocks of consecutive rays are tested before each ray.
-        if len(self.bodies) < 2 or not len(rays.time_s):
+        num = len(rays.time_s)
+        if not num:
             return
-        first = np.arange(0, len(rays.time_s), _BLOCK)
-        count = np.diff(np.append(first, len(rays.time_s)))
-        origin, direction = (
-            np.add.reduceat(column, first) / count[:, None]
+        first = np.arange(0, num, _BLOCK)
+        first_of_ray = np.arange(num) // _BLOCK * _BLOCK
+        # Greatest differences within each block from the origin and direction of its first ray
+        block_radius_m, block_spread = (
+            np.maximum.reduceat(lengths(column - column[first_of_ray])[:, 0], first)
             for column in (rays.origin, rays.direction)
         )
-        direction /= np.maximum(lengths(direction), _TINY)
-        # Greatest differences within each block from its mean origin and direction
-        block_radius_m, block_spread = (
-            np.maximum.reduceat(lengths(column - np.repeat(mean, count, axis=0))[:, 0], first)
-            for column, mean in ((rays.origin, origin), (rays.direction, direction))
-        )
-        blocks = _Segments(origin, direction, np.maximum.reduceat(farthest_m, first))
+        blocks, block_farthest_m = rays.rows(first), np.maximum.reduceat(farthest_m, first)
         for index, (centre, radius_m) in enumerate(self._balls(rays.time_s), start=1):
-            is_near = _meets_ball(blocks, centre, radius_m + block_radius_m, spread + block_spread)
-            rows = (np.flatnonzero(is_near)[:, None] * _BLOCK + np.arange(_BLOCK)).ravel()
-            rows = rows[: np.searchsorted(rows, len(rays.time_s))]  # the last block may be smaller
-            segments = _Segments(rays.origin[rows], rays.direction[rows], farthest_m[rows])
-            rows = rows[_meets_ball(segments, centre, radius_m, spread)]
-            if len(rows):
-                yield index, rows
+            block_ball = centre, radius_m + block_radius_m, spread + block_spread
+            is_near = _meets_ball(blocks, block_farthest_m, *block_ball)
+            rows = (first[is_near, None] + np.arange(_BLOCK)).ravel()
+            rows = rows[rows < num]  # the last block may be smaller
+            meets = _meets_ball(rays.rows(rows), farthest_m[rows], centre, radius_m, spread)
+            if meets.any():
+                yield index, rows[meets]
 
     def _balls(self, times_s: Float) -> Iterator[tuple[Float, float]]:
         """Yield centre (3,) and radius of a ball around each moving body at all of these times."""
@@ -243,15 +199,10 @@ class World:
             reach_m = np.linalg.norm(high - low) + np.linalg.norm(np.subtract(*body.mesh.bounds))
             yield (low + high) / 2, float(reach_m) / 2 + _SLACK_M
 
-    def _cast_bodies(
-        self,
-        spans: Sequence[tuple[int, int]],
-        origin: Float,
-        direction: Float,
-        number: Int,
-        optics: Optics,
+    def _cast_at_body(
+        self, body: int, origin: Float, direction: Float, number: Int, optics: Optics
     ) -> Hits:
-        """Return the hits of rays, each with one body and in the frame of that body."""
+        """Return the hits of rays with one body, in its frame; ``number`` (N,) has ray indices."""
         # Distances are to the plane of the triangle, in double precision, also for absorbed rays.
         surfaces = self.triangles
         n = len(origin)
@@ -261,28 +212,25 @@ class World:
         )  # fmt: skip
         # The rays that still travel: indices, origins behind the last surface, directions, and the
         # object of that surface
-        rows = np.arange(n)
-        start, ray = origin, direction
-        passed = np.full(n, -1, np.int32)
+        rows, start, ray, passed = np.arange(n), origin, direction, np.full(n, -1, np.int32)
         for layer in range(_MAX_LAYERS):
-            ends = np.searchsorted(rows, [end for _, end in spans]).tolist()
-            spans_left = zip((index for index, _ in spans), ends, strict=True)
-            met, triangle, barycentric = surfaces.first_hit(spans_left, start, ray)
-            if not len(met):
+            if not len(rows):
                 break
-            rows, passed, ray = rows[met], passed[met], ray.take(met, axis=0)
-            ray_origin = origin.take(rows, axis=0)
-            normal = surfaces.normal.take(triangle, axis=0)
-            corner = surfaces.corner.take(triangle, axis=0)
-            facing = np.einsum("ni,ni->n", ray, normal)
-            distance_m = np.einsum("ni,ni->n", corner - ray_origin, normal) / facing
-            meeting = Meeting(
-                number[rows], triangle, layer, ray_origin, ray, distance_m, facing, passed
+            traced = surfaces.scenes[body].run(
+                start.astype(np.float32), ray.astype(np.float32), query="INTERSECT", output=True
             )
-            outcome = optics(meeting)
+            met = np.flatnonzero(traced["primID"] >= 0)
+            triangle = traced["primID"][met] + surfaces.first[body]
+            rows, passed, ray = rows[met], passed[met], ray[met]
+            ray_origin, normal = origin[rows], surfaces.normal[triangle]
+            facing = np.einsum("ni,ni->n", ray, normal)
+            to_corner = surfaces.corner[triangle] - ray_origin
+            distance_m = np.einsum("ni,ni->n", to_corner, normal) / facing
+            position = ray_origin + distance_m[:, None] * ray
+            outcome = optics(Meeting(number[rows], triangle, layer, position, facing, passed))
             hits.range_m[rows] = distance_m
             hits.triangle[rows] = triangle
-            hits.barycentric[rows] = barycentric
+            hits.barycentric[rows] = np.stack([traced["u"][met], traced["v"][met]], axis=1)
             hits.absorbed[rows] = outcome == ABSORBED
             hits.normal[rows] = normal
 
@@ -296,48 +244,17 @@ class World:
         return hits
 
 
-class _Candidate(NamedTuple):
-    """A moving body with the groups of rays that may hit it."""
-
-    body: int  # index of the body
-    groups: Int  # (G,) indices of the groups
-    poses: Poses  # G poses of the body at the times of the groups
-
-
-class _Segments(NamedTuple):
-    """N rays up to a distance."""
-
-    origin: Float  # (N,3)
-    direction: Float  # (N,3) unit vectors
-    length_m: Float  # (N,)
-
-
 def _meets_ball(
-    rays: _Segments, centre: Float, radius_m: Float | float, spread: Float | float
+    rays: Rays, length_m: Float, centre: Float, radius_m: Float | float, spread: Float | float
 ) -> Bool:
-    """Return (N,) True for rays that meet a ball, by the greatest angle from their direction."""
+    """Return (N,) True for rays that meet a ball within a length (N,).
+
+    ``spread`` is the greatest angle (rad) by which the true ray deviates from each ray.
+    """
     to_centre = centre - rays.origin
     along_m = np.einsum("ni,ni->n", to_centre, rays.direction)
     squared_m2 = np.einsum("ni,ni->n", to_centre, to_centre)
     # Up to the far side of the ball, the true ray deviates by at most the spread times the range.
     reach_m = radius_m + spread * (np.sqrt(squared_m2) + radius_m)
     meets: Bool = squared_m2 - along_m * along_m < reach_m * reach_m
-    return meets & (along_m > -reach_m) & (along_m - reach_m < rays.length_m)
-
-
-@cache
-def _device() -> Any:
-    """Return the one Embree device of all scenes: after a thousand devices Embree fails."""
-    from embreex.rtcore import EmbreeDevice
-
-    return EmbreeDevice()
-
-
-def _raycasting_scene(corners: Float32) -> Any:
-    """Return the Embree scene of (T,3,3) triangle corners."""
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
-    scene = EmbreeScene(_device())
-    TriangleMesh(scene, corners)
-    return scene
+    return meets & (along_m > -reach_m) & (along_m - reach_m < length_m)
