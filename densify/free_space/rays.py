@@ -36,8 +36,8 @@ _AT_ONCE = 0.03  # greatest spread of a column's firing times, as a share of a s
 _NUM_WINDOWS = 5  # windows of 1, 3, 7, 15, 31 cells, for the density of an unordered scanner
 
 BLOCK = 128  # number of points that a kernel moves together
-_PI, _HALF_PI = np.float32(np.pi), np.float32(0.5 * np.pi)
-_HALF, _ZERO = np.float32(0.5), np.float32(0)
+PI, _HALF_PI = np.float32(np.pi), np.float32(0.5 * np.pi)
+_HALF, ZERO = np.float32(0.5), np.float32(0)
 # Abramowitz and Stegun, "Handbook of Mathematical Functions", 4.4.47: arctan within 1e-5 rad, far
 # less than a cell.
 _A1, _A3, _A5, _A7, _A9 = (
@@ -52,14 +52,14 @@ def azimuth_of(x, y):  # type: ignore[no-untyped-def]
     # It holds up to 45 degrees; symmetries give the other octants.
     ax, ay = abs(x), abs(y)
     is_steep = ay > ax
-    ratio = ax / ay if is_steep else (ay / ax if ax > _ZERO else _ZERO)
+    ratio = ax / ay if is_steep else (ay / ax if ax > ZERO else ZERO)
     square = ratio * ratio
     angle = ratio * (_A1 + square * (_A3 + square * (_A5 + square * (_A7 + square * _A9))))
     if is_steep:
         angle = _HALF_PI - angle
-    if x < _ZERO:
-        angle = _PI - angle
-    return -angle if y < _ZERO else angle
+    if x < ZERO:
+        angle = PI - angle
+    return -angle if y < ZERO else angle
 
 
 @inlined
@@ -67,7 +67,7 @@ def move_to_time(x, y, z, time_s, twists):  # type: ignore[no-untyped-def]
     """Move a point from the reference time to the lidar frame at ``time_s``: undo deskewing."""
     # The inverse rotation of p = point - translation is p - r x p + r x (r x p) / 2 to second order
     # in the rotation vector r, which stays below 0.1 rad within a sweep.
-    w = 0 if time_s < _ZERO else 1
+    w = 0 if time_s < ZERO else 1
     rx, ry, rz = twists[w, 0] * time_s, twists[w, 1] * time_s, twists[w, 2] * time_s
     px, py, pz = x - twists[w, 3] * time_s, y - twists[w, 4] * time_s, z - twists[w, 5] * time_s
     tx, ty, tz = ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px  # r x p
