@@ -20,12 +20,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.free_space.rays import (
+from densify.free_space.sensor import (
     BLOCK,
     FEW_POINTS,
     PI,
     ZERO,
     AimedRays,
+    Sensors,
     aim_rays,
     azimuth_of,
     fires_by_azimuth,
@@ -33,7 +34,6 @@ from densify.free_space.rays import (
     move_to_scanner,
     move_to_time,
 )
-from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel, inlined, num_threads
