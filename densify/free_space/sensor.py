@@ -129,7 +129,7 @@ def aim_rays(registered: RegisteredSweep, lidar: int) -> AimedRays:
         np.stack([registered.twist_before, registered.twist_after]).astype(np.float32),
         rays,
     )
-    return AimedRays(*rays, offset_s)
+    return AimedRays(rays[0], rays[1], rays[2], offset_s)
 
 
 class RayTable(NamedTuple):
