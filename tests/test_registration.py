@@ -14,9 +14,8 @@ from densify.geometry import poses
 from densify.geometry.types import Trajectory
 from densify.readers.street import Street
 from densify.readers.timeline import read_sweep
-from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
-from densify.registration.odometry import register_on_surfaces
+from densify.registration.odometry import register_on_surfaces, subsample
 from densify.registration.trajectory import check_plausible, find_trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 

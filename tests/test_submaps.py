@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from densify.geometry import poses
 from densify.geometry.types import Sweep
 from densify.registration import road_poses
-from densify.registration.alignment import Alignment, Surface, subsample
+from densify.registration.odometry import Alignment, Surface, subsample
 from densify.registration.road_poses import relax_poses
 from tests.scenes import Arc, Scanner, Scene, World, street
 

@@ -57,7 +57,7 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
     Raises:
         InputError: If the lens model is unknown, or its coefficients are wrong in number or value.
     """
-    lens = _lens(camera)
+    lens = _lens(camera.name, camera.model, tuple(camera.distortion))
     uv = np.full((len(points_cam), 2), np.nan)
     visible = np.zeros(len(points_cam), bool)
     rows_ahead = np.flatnonzero(depth_along(points_cam, camera.measure) > NEAREST_M)
@@ -77,7 +77,7 @@ def rays(camera: Camera, uv: Float) -> Float:
     Integers are at pixel centres. A pixel outside the view of the lens has NaN. A wrong lens raises
     InputError, as in `image_points`.
     """
-    lens = _lens(camera)
+    lens = _lens(camera.name, camera.model, tuple(camera.distortion))
     plane_xy = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
     if not camera.is_rectified:
         plane_xy = _undistort(lens, plane_xy)
@@ -93,7 +93,7 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
 
     Element [n, i, j] is the change of u (i = 0) or v (i = 1) in pixels per metre along axis j.
     """
-    lens = _lens(camera)
+    lens = _lens(camera.name, camera.model, tuple(camera.distortion))
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
     ray = points_cam / range_m
     # An axis perpendicular to each ray: its product with the coordinate axis farthest from it.
@@ -147,28 +147,22 @@ class _Lens(NamedTuple):
     limit: float  # squared radius up to which the distorted radius grows
 
 
-def _lens(camera: Camera) -> _Lens:
+@lru_cache
+def _lens(name: str, model: str, coef: tuple[float, ...]) -> _Lens:
     """Return the lens of a camera; raise InputError for an unknown model or bad coefficients."""
-    coef = camera.distortion
-    if camera.model not in _COEFFICIENTS:
+    if model not in _COEFFICIENTS:
         raise InputError(
-            f"camera {camera.name}: model: got {camera.model!r}, expected one of "
+            f"camera {name}: model: got {model!r}, expected one of "
             f"{', '.join(_COEFFICIENTS)}; rectify the images if the lens is another"
         )
-    lengths = _COEFFICIENTS[camera.model]
+    lengths = _COEFFICIENTS[model]
     if len(coef) not in lengths or not np.isfinite(coef).all() or any(coef[_NUM_RATIONAL:]):
         expected = " or ".join(str(n) for n in lengths if n <= _NUM_RATIONAL)
         raise InputError(
-            f"camera {camera.name}: distortion: expected {expected} finite coefficients of a "
-            f"{camera.model} lens in their usual order, any others 0, got {list(coef)}; correct "
+            f"camera {name}: distortion: expected {expected} finite coefficients of a "
+            f"{model} lens in their usual order, any others 0, got {list(coef)}; correct "
             f"the calibration or rectify the images"
         )
-    return _lens_of(camera.model, tuple(coef))
-
-
-@lru_cache
-def _lens_of(model: str, coef: tuple[float, ...]) -> _Lens:
-    """Return the lens of a model with these coefficients."""
     denominator_terms: tuple[float, ...] = (1.0,)
     p1 = p2 = 0.0
     if model == "fisheye":

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Register sweeps, point to plane, on the surfaces of the preceding second.
+"""Align surfaces by small_gicp, and register sweeps on the surfaces of the preceding second.
 
-KISS-ICP (Vizzo et al., RA-L 2023) predicts the motion of dense sweeps. It matches a sweep with the
-scan pattern of earlier ones: a rosette that turns 7 degrees a sweep turns these poses with it.
-Surface normals of one second do not depend on the pattern (Chen, Medioni, "Object modelling by
-registration of multiple range images", IVC 1992).
+Segal et al., "Generalized-ICP", RSS 2009; Koide, "small_gicp", JOSS 2024. KISS-ICP (Vizzo et al.,
+RA-L 2023) predicts the motion of dense sweeps. It matches a sweep with the scan pattern of earlier
+ones: a rosette that turns 7 degrees a sweep turns these poses with it. Surface normals of one
+second do not depend on the pattern (Chen, Medioni, "Object modelling by registration of multiple
+range images", IVC 1992).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import small_gicp
@@ -22,9 +23,10 @@ from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep
-from densify.registration.alignment import FEW_POINTS, Surface, align, subsample
 from densify.registration.deskew import deskew_points
 
+MANY_POINTS = 30_000  # points of a sweep that makes a surface
+FEW_POINTS = 15_000  # points of a sweep that is aligned
 _SURFACE_NS = 1_050_000_000  # 1 s, with a tolerance for irregular stamps
 # A pattern that does not repeat fills its field of view in this time. The surface of one sweep
 # therefore serves the sweeps of this time too.
@@ -35,6 +37,73 @@ _VOXEL_M = 0.25  # voxel in which surfaces and aligned sweeps keep one point
 # Damping: the information of one match in a hundred, 10 m away, for a motion of zero. It keeps a
 # sweep in place along highways, where one plane in fifty constrains the motion.
 _DAMPING = np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
+
+
+def subsample(sweep: Sweep, max_points: int = MANY_POINTS) -> Sweep:
+    """Return about ``max_points`` points of a larger sweep, spread evenly over its rings."""
+    num = len(sweep)
+    if num <= max_points:
+        return sweep
+    # The multiples of the golden ratio, modulo 1, are spread evenly in [0, 1). Points below a
+    # threshold are therefore an even sample of each ring, in any order of the rings.
+    fraction = np.arange(num) * 0.6180339887498949
+    fraction -= np.floor(fraction)
+    return sweep.select(fraction < max_points / num)
+
+
+class Surface(NamedTuple):
+    """Points thinned to voxels, with the normal and covariance of each point's neighbours."""
+
+    points: Any  # a ``PointCloud`` of small_gicp, in metres
+    tree: Any  # the k-d tree of these points
+
+    @staticmethod
+    def of(points: Float, voxel_m: float = 0.5, num_neighbors: int = 10) -> Surface:
+        """Return the surface of points (N,3), one per voxel, with normals, in their frame."""
+        return Surface(*small_gicp.preprocess_points(points, voxel_m, num_neighbors, 1))
+
+    @staticmethod
+    def of_sweep(sweep: Sweep) -> Surface:
+        """Return the surface of a deskewed sweep, in its lidar frame."""
+        return Surface.of(subsample(sweep).points)
+
+
+class Alignment(NamedTuple):
+    """The alignment of a source with a target surface."""
+
+    T_target_source: Float  # (4,4) pose of the source in the target's frame
+    overlap: float  # share of the source's points with a match in the target
+    # (6,6) matrix of a quadratic form. For a small motion x (rad, m) of the source in its own
+    # frame, ``x @ information @ x`` is the mean square distance (m²) of the source from the target.
+    information: Float
+
+
+def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
+    """Align a source with a target, and return the alignment.
+
+    A source `Surface` is aligned by generalized ICP, other points are aligned point to plane.
+
+    Args:
+        target: A `Surface`, or a ``GaussianVoxelMap`` of surfaces.
+        source: A `Surface`, or a ``PointCloud`` without covariances, in its own frame.
+        T_target_source: (4,4) initial pose of the source.
+        match_m: Greatest distance in metres between corresponding points.
+    """
+    is_surface = isinstance(source, Surface)
+    points = source.points if is_surface else source
+    options: dict[str, Any] = {"max_correspondence_distance": match_m, "num_threads": 1}
+    if isinstance(target, Surface):
+        kind = "GICP" if is_surface else "PLANE_ICP"
+        fit = small_gicp.align(target.points, points, target.tree, T_target_source, kind, **options)
+    else:
+        fit = small_gicp.align(target, points, T_target_source, **options)
+    # H is a sum over matches. Generalized ICP divides squared distances by the variance of both
+    # surfaces along the normal, whose standard deviation is 0.0447 m.
+    num_matches = max(int(fit.num_inliers), 1)
+    scale_m2 = 0.0447**2 if is_surface else 1.0
+    information = np.asarray(fit.H) * scale_m2 / num_matches
+    overlap = fit.num_inliers / max(int(points.size()), 1)
+    return Alignment(np.asarray(fit.T_target_source), overlap, information)
 
 
 def register_on_surfaces(

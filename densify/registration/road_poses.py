@@ -21,8 +21,8 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
-from densify.registration.alignment import FEW_POINTS, Alignment, Surface, align, subsample
 from densify.registration.deskew import deskew_points
+from densify.registration.odometry import FEW_POINTS, Alignment, Surface, align, subsample
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _PAIR_DISTANCES = (1, 4, 8)  # of the aligned pairs, in submaps

@@ -17,9 +17,9 @@ from densify.free_space.ground import find_upright
 from densify.geometry import poses
 from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
-from densify.registration.alignment import MANY_POINTS
 from densify.registration.odometry import (
     FRESH_NS,
+    MANY_POINTS,
     MAX_SPEED_M_S,
     above_ground,
     find_odometry,
