@@ -78,13 +78,21 @@ class Alignment(NamedTuple):
     information: Float
 
 
+def make_map() -> Any:
+    """Return an empty map of surfaces, a ``GaussianVoxelMap`` of small_gicp with 1 m voxels.
+
+    Koide et al., "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021.
+    """
+    return small_gicp.GaussianVoxelMap(1.0)
+
+
 def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
     """Align a source with a target, and return the alignment.
 
     A source `Surface` is aligned by generalized ICP, other points are aligned point to plane.
 
     Args:
-        target: A `Surface`, or a ``GaussianVoxelMap`` of surfaces.
+        target: A `Surface`, or a map (`make_map`) of surfaces.
         source: A `Surface`, or a ``PointCloud`` without covariances, in its own frame.
         T_target_source: (4,4) initial pose of the source.
         match_m: Greatest distance in metres between corresponding points.

@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-import small_gicp
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
@@ -22,7 +21,14 @@ from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
 from densify.registration.deskew import deskew_points
-from densify.registration.odometry import FEW_POINTS, Alignment, Surface, align, subsample
+from densify.registration.odometry import (
+    FEW_POINTS,
+    Alignment,
+    Surface,
+    align,
+    make_map,
+    subsample,
+)
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _PAIR_DISTANCES = (1, 4, 8)  # of the aligned pairs, in submaps
@@ -53,9 +59,7 @@ def follow_road(
         reach_m: Distance along the road to cover.
         step_m: Distance along the road between the sweeps that are read.
     """
-    # Koide et al., "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021;
-    # with voxels of 1 m
-    chain = small_gicp.GaussianVoxelMap(1.0)
+    chain = make_map()
     for registered, surface in zip(window_sweeps, window_surfaces, strict=True):
         chain.insert(surface.points, registered.T_world_lidar)
     latest = window_sweeps[-1]
