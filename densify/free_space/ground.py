@@ -48,10 +48,7 @@ class HeightMap:
         images from below the road. A limit on the slope removes cars and walls.
         """
         gridded, low_m, shape = _fit_grid(clouds)
-        cells = [
-            np.ravel_multi_index(((points[:, :2] - low_m) / _CELL_M).astype(np.int64).T, shape)
-            for points in gridded
-        ]
+        cells = [_cells_of(points, low_m, shape[1]) for points in gridded]
         heights = _median_of_lowest(gridded, cells, shape[0] * shape[1]).reshape(shape)
 
         is_measured = np.isfinite(heights)
@@ -137,6 +134,12 @@ def _fit_grid(clouds: Sequence[Float]) -> tuple[list[Float], Float, tuple[int, i
     low_m = np.floor(low_m / _CELL_M) * _CELL_M
     num_x, num_y = ((high_m - low_m) / _CELL_M).astype(np.int64) + 1
     return gridded, low_m, (int(num_x), int(num_y))
+
+
+def _cells_of(points: Float, low_m: Float, num_y: int) -> Int:
+    """Return the (N,) number of each point's grid cell; a row of the grid has ``num_y`` cells."""
+    x, y = (((points[:, axis] - low_m[axis]) / _CELL_M).astype(np.int64) for axis in (0, 1))
+    return x * num_y + y
 
 
 def _median_of_lowest(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int) -> Float:

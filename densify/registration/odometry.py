@@ -360,8 +360,8 @@ def above_ground(points: Float) -> Float:
     """
     if not len(points):
         return points
-    z = points[:, 2]
-    cell = np.floor(points[:, :2].T).astype(np.int64)
+    x, y, z = np.ascontiguousarray(points.T)
+    cell = np.floor([x, y]).astype(np.int64)
     cell -= cell.min(axis=1, keepdims=True)
     number = np.ravel_multi_index(tuple(cell), tuple(cell.max(axis=1) + 1))
     lowest = np.full(number.max() + 1, np.inf)
