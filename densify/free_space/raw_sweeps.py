@@ -178,8 +178,8 @@ def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
         if distance_m[i] <= _STEP_M:
             return False
         others = [origins[i], *_positions_around(positions[i], _STEP_M, 4)]
-        lowest_share = min(share_behind(sweeps[i].points, other) for other in others)
-        if share_behind(sweeps[i].points, positions[i]) >= _MAX_OCCLUDED_RATIO * lowest_share:
+        lowest_share = min(_share_behind(sweeps[i].points, other) for other in others)
+        if _share_behind(sweeps[i].points, positions[i]) >= _MAX_OCCLUDED_RATIO * lowest_share:
             return False
     return True
 
@@ -199,7 +199,7 @@ def way_in_map(first: Sweep, last: Sweep) -> float:
     return distance_m if distance_m > _MIN_MOTION_M else 0.0
 
 
-def share_behind(points: Float, origin: Float) -> float:
+def _share_behind(points: Float, origin: Float) -> float:
     """Return the share of points (N,3) that lie behind others, seen from ``origin`` (3,)."""
     azimuth, elevation, range_m = _directions(points - origin)
     has_direction = range_m > 0
@@ -220,14 +220,14 @@ def _find_scanner(sweep: Sweep, start: Float) -> Float:
     # occluded there than at the start. Silhouettes split beams, hence up to 1 % of the returns seem
     # occluded from the scanner itself.
     points = sweep.points[::2]
-    start_share = lowest_share = share_behind(points, start)
+    start_share = lowest_share = _share_behind(points, start)
     if start_share < 0.01:
         return start
     best_position = start
     for step_m in _STEP_M * 0.5 ** np.arange(4):
         for _ in range(20):
             positions = _positions_around(best_position, step_m, 8)
-            shares = [share_behind(points, position) for position in positions]
+            shares = [_share_behind(points, position) for position in positions]
             if min(shares) >= lowest_share:
                 break
             best_position = positions[int(np.argmin(shares))]
