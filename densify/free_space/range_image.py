@@ -236,7 +236,7 @@ def _make_image(
     """Return the range image of one scanner, made from its rays."""
     sweep = registered.sweep
     shape = len(cells.row_edges_rad) - 1, cells.num_columns
-    row, column = _cell_of(rays, *cells[:2])
+    row, column = _cell_of(rays, cells.row_edges_rad, cells.num_columns)
     in_rows = np.flatnonzero(row >= 0)
     cell = row[in_rows] * cells.num_columns + column[in_rows]
 

@@ -356,15 +356,15 @@ def _find_peaks(counts: Float) -> Int:
     extreme = 0  # index of the highest count of this rise, or of the lowest of this fall
     is_rising = True
     for i, count in enumerate(counts.tolist()):
-        if is_rising and count < 0.5 * counts[extreme]:
+        if is_rising and count > counts[extreme]:
+            extreme = i
+        elif is_rising and count < 0.5 * counts[extreme]:
             peaks.append(extreme)
-            is_rising = False
+            extreme, is_rising = i, False
+        elif not is_rising and count < counts[extreme]:
             extreme = i
         elif not is_rising and 0.5 * count > counts[extreme]:
-            is_rising = True
-            extreme = i
-        elif count > counts[extreme] if is_rising else count < counts[extreme]:
-            extreme = i
+            extreme, is_rising = i, True
     return np.array(peaks, np.int64)
 
 
