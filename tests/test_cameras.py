@@ -49,9 +49,8 @@ def test_a_pinhole_with_distortion_equals_opencv(lens):
     points = np.column_stack([rng.uniform(-0.6, 0.6, (500, 2)), np.ones(500)])
     points *= rng.uniform(0.5, 80, (500, 1))
     uv, _ = image_points(camera, points)
-    truth, jacobian = cv2.projectPoints(
-        points, np.zeros(3), np.zeros(3), camera.K, np.array(lens) if lens else None
-    )
+    coefficients = np.array(lens) if lens else None
+    truth, jacobian = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.K, coefficients)
     np.testing.assert_allclose(uv, truth[:, 0], atol=1e-9)
     by_translation = jacobian[:, 3:6].reshape(-1, 2, 3)
     np.testing.assert_allclose(pixels_per_metre(camera, points), by_translation, atol=1e-5)
@@ -176,10 +175,14 @@ def test_the_sphere_of_mei_ends_where_its_radius_does(xi, ends_deg):
 
 
 @pytest.mark.parametrize(
-    "lens",
-    [(0.1,), (np.nan,) * 4, (0.1,) * 12],
-    ids=["one", "nan", "thin prism"],
+    ("model", "lens", "message"),
+    [
+        ("pinhole", (0.1,), "distortion: expected 0 or 4 or 5 or 8"),
+        ("pinhole", (np.nan,) * 4, "distortion: expected 0 or 4 or 5 or 8"),
+        ("pinhole", (0.1,) * 12, "distortion: expected 0 or 4 or 5 or 8"),  # thin prism
+        ("bowl", (), "model: got 'bowl', expected one of pinhole, fisheye, mei"),
+    ],
 )
-def test_bad_distortion_is_named(lens):
-    with pytest.raises(InputError, match="camera cam: distortion: expected 0 or 4 or 5 or 8"):
-        image_points(make_camera(lens), np.ones((1, 3)))
+def test_a_bad_lens_is_named(model, lens, message):
+    with pytest.raises(InputError, match=f"camera cam: {message}"):
+        image_points(make_camera(lens, model), np.ones((1, 3)))

@@ -33,9 +33,9 @@ def double(tmp_path, monkeypatch):
     del sys.modules["doubling"]
 
 
-def check(kernel: kernels.Kernel) -> None:
-    values = np.arange(1001.0)
-    out = np.zeros_like(values)
+def check(kernel: kernels.Kernel, num_rows: int = 1001) -> None:
+    values = np.arange(float(num_rows))
+    out = np.full_like(values, -1)
     kernel.over_rows(len(values), values, out)
     np.testing.assert_array_equal(out, 2 * values)
 
@@ -93,10 +93,7 @@ def shared_out(monkeypatch):
 
 @pytest.mark.parametrize("num_rows", [0, 99, 1001])
 def test_a_kernel_does_every_row(double, shared_out, num_rows):
-    values = np.arange(float(num_rows))
-    out = np.full_like(values, -1)
-    kernels.Kernel(double).over_rows(num_rows, values, out)
-    np.testing.assert_array_equal(out, 2 * values)
+    check(kernels.Kernel(double), num_rows)
 
 
 @pytest.mark.parametrize("where", ["first", "others"])

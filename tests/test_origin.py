@@ -8,9 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.flow.tracking.candidates import find_candidates
 from densify.free_space.ground import ground
-from densify.free_space.range_image import FreeSpace
 from densify.geometry.types import Stretch
 from tests.dataset_scenes import COARSE
 from tests.found_motion import motion_in
@@ -45,23 +43,6 @@ def seen_from(stretch: Stretch, shift_m=(0.0, 0.0, 0.0), yaw_deg: float = 0.0) -
 def moving(stretch: Stretch) -> np.ndarray:
     motion = motion_in(stretch, ground(stretch))
     return np.concatenate([instance >= 0 for instance in motion.track_of_point])
-
-
-def test_candidates_are_the_same_groups(stretch: Stretch) -> None:
-    def found(there: Stretch):
-        heights = ground(there)
-        return find_candidates(there, FreeSpace.of(there), heights)
-
-    here = found(stretch)
-    assert sum(c.num_clusters for c in here) > 20
-    shifted = found(seen_from(stretch, SHIFT_M))
-    for a, b in zip(here, shifted, strict=True):
-        # The ground's cells begin elsewhere, so a few points at the least height differ.
-        both, in_a, in_b = np.intersect1d(a.row, b.row, return_indices=True)
-        assert len(both) > 0.99 * max(len(a.row), len(b.row))
-        pairs = set(zip(a.cluster[in_a], b.cluster[in_b], strict=True))
-        assert (a.seed[in_a] == b.seed[in_b]).mean() > 0.999
-        assert len(pairs) <= max(a.num_clusters, b.num_clusters) + 2  # one to one, and none
 
 
 @pytest.fixture(scope="module")

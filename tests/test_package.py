@@ -186,7 +186,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "numba": ("densify/geometry/compiled.py",),
     "pickle": ("densify/readers/column_files.py",),
     "simplejpeg": "densify/readers/decoded_files.py",
-    "small_gicp": "densify/registration/alignment.py",
+    "small_gicp": "densify/registration/odometry.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py", "densify/learning/"),
 }
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from densify.config.errors import InputError
-from densify.free_space.rays import find_rings
+from densify.free_space.sensor import find_rings
 from densify.readers import open_sequence
 from densify.readers.packets import MODELS, Ouster, Velodyne, count_lost_and_repeated
 from tests.reader_checks import check_refused

@@ -14,7 +14,7 @@ from writers import write_street
 from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
-from densify.free_space.rays import find_rings
+from densify.free_space.sensor import find_rings
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.column_files import read_pickled

@@ -14,9 +14,8 @@ from densify.geometry import poses
 from densify.geometry.types import Trajectory
 from densify.readers.street import Street
 from densify.readers.timeline import read_sweep
-from densify.registration.alignment import subsample
 from densify.registration.deskew import deskew
-from densify.registration.odometry import find_odometry, register_on_surfaces, search_twist
+from densify.registration.odometry import register_on_surfaces, subsample
 from densify.registration.trajectory import check_plausible, find_trajectory
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, street
 
@@ -48,12 +47,8 @@ def test_stamps_have_to_ascend(raw, late_ms):
 def errors(found: Trajectory, true: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """(n,) metres and degrees of the poses relative to the key's."""
     i = found.frames.index(KEY)
-    off = [
-        poses.log(poses.inverse(poses.inverse(a0) @ a) @ poses.inverse(b0) @ b)
-        for a, b in zip(true.T_world_lidar, found.T_world_lidar, strict=True)
-        for a0, b0 in [(true.T_world_lidar[i], found.T_world_lidar[i])]
-    ]
-    off = np.array(off)
+    from_key = [poses.inverse(t.T_world_lidar[i]) @ t.T_world_lidar for t in (true, found)]
+    off = poses.log(poses.inverse(from_key[0]) @ from_key[1])
     return np.linalg.norm(off[:, 3:], axis=1), np.rad2deg(np.linalg.norm(off[:, :3], axis=1))
 
 
@@ -68,13 +63,14 @@ def test_the_drive_is_recovered(drive, raw, rate):
     assert off_m.mean() < 0.02 and off_deg.max() < 0.1
 
 
-@pytest.mark.parametrize("hz", [10, 20])
-def test_odometry_does_not_stand_still_on_a_highway(hz):
-    """Most points are rings on flat ground, which move with the vehicle."""
-    road = Street("highway", 5, "hdl64", hz=hz)
-    sweeps = [read_sweep(road, f, SETTINGS) for f in range(64 * hz // 10, 64 * hz // 10 + 7)]
-    twists = find_odometry(sweeps, SETTINGS)
-    assert twists.shape == (7, 6) and np.abs(twists[:, 3:] - [25, 0, 0]).max() < 1.5
+@pytest.mark.parametrize(("seed", "hz", "first"), [(5, 10, 64), (5, 20, 128), (23, 20, 205)])
+def test_a_drive_on_a_highway_does_not_look_like_standing_still(seed, hz, first):
+    """Most points are rings on flat ground, which move with the vehicle. The same rays meet guard
+    rails in every sweep, more so at a high rate."""
+    road = Street("highway", seed, "hdl64", hz=hz)
+    sweeps = [read_sweep(road, frame, SETTINGS) for frame in range(first, first + 5)]
+    T = find_trajectory(sweeps, SETTINGS).T_world_lidar
+    assert np.linalg.norm(T[-1, :3, 3] - T[0, :3, 3]) * hz / 4 == pytest.approx(25, abs=1)
 
 
 @pytest.fixture(scope="module")
@@ -84,27 +80,18 @@ def fast_drive() -> Scene:
 
 
 @pytest.mark.parametrize(
-    "frames", [(0, 2, 4, 6, 8), (0, 1, 2, 5, 6, 8, 9)], ids=["every second", "holes"]
+    "frames",
+    [(0, 2, 4, 6, 8), (0, 3, 6, 9), (0, 1, 2, 5, 6, 8, 9)],
+    ids=["every second", "every third", "holes"],
 )
 def test_sweeps_may_be_missing(fast_drive, frames):
     """A hole of three periods at 36 m/s is 7 m longer than the step before it."""
     found = find_trajectory([fast_drive.scan(f).sweep for f in frames], SETTINGS)
     true = fast_drive.trajectory(frames).T_world_lidar
-    for i in range(len(frames) - 1):
-        step = poses.inverse(true[i]) @ true[i + 1]
-        found_step = poses.inverse(found.T_world_lidar[i]) @ found.T_world_lidar[i + 1]
-        off = poses.log(poses.inverse(step) @ found_step)
-        assert np.linalg.norm(off[3:]) < 0.2
-        assert np.rad2deg(np.linalg.norm(off[:3])) < 0.2
-
-
-@pytest.mark.parametrize("period_s", [0.1, 0.2, 0.3])
-def test_the_start_is_found_at_any_rate(fast_drive, period_s):
-    frames = [round(i * period_s / SWEEP_S) for i in range(3)]
-    sweeps = [fast_drive.scan(f).sweep for f in frames]
-    stamp_ns = np.array([s.stamp_ns for s in sweeps])
-    twist = search_twist(stamp_ns, [s.points for s in sweeps])
-    assert np.abs(twist * period_s - [0, 0, 0, 36.0 * period_s, 0, 0]).max() < 0.6
+    steps = [poses.inverse(T[:-1]) @ T[1:] for T in (true, found.T_world_lidar)]
+    off = poses.log(poses.inverse(steps[0]) @ steps[1])
+    assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.2
+    assert np.rad2deg(np.linalg.norm(off[:, :3], axis=1)).max() < 0.2
 
 
 def test_what_odometry_leaves_is_mended(drive, raw):
@@ -116,23 +103,15 @@ def test_what_odometry_leaves_is_mended(drive, raw):
     assert off_m.mean() < 0.02 and off_deg.max() < 0.1
 
 
-@pytest.fixture(scope="module")
-def walled() -> Scene:
+def test_static_points_come_to_where_they_are_at_the_reference_time():
     walls = (Box((120, 2, 6), Arc(0, 12)), Box((120, 2, 6), Arc(0, -14)), *street())
-    return Scene(World(walls), Arc(0, 0, 0, 12.0, 0.4))
-
-
-def test_static_points_come_to_where_they_are_at_the_reference_time(walled):
-    for frame in (3, KEY):
-        registered = walled.stretch(frame, 0)[frame]
-        T = walled.T_world_lidar(frame * SWEEP_S)
-        true = poses.transform(poses.inverse(T), walled.scan(frame).world)
-        raw_error = np.linalg.norm(
-            registered.sweep.points - walled.scan(frame).sweep.points, axis=1
-        )
-        error = np.linalg.norm(registered.sweep.points - true, axis=1)
-        assert raw_error.max() > 0.6  # half a sweep at 12 m/s
-        assert error.max() < 0.01  # the arc within a sweep is taken for a straight line
+    walled = Scene(World(walls), Arc(0, 0, 0, 12.0, 0.4))
+    registered, scan = walled.stretch(KEY, 0)[KEY], walled.scan(KEY)
+    true = poses.transform(poses.inverse(walled.T_world_lidar(KEY * SWEEP_S)), scan.world)
+    raw_error = np.linalg.norm(registered.sweep.points - scan.sweep.points, axis=1)
+    error = np.linalg.norm(registered.sweep.points - true, axis=1)
+    assert raw_error.max() > 0.6  # half a sweep at 12 m/s
+    assert error.max() < 0.01  # the arc within a sweep is taken for a straight line
 
 
 def test_each_half_moves_with_its_own_twist():
@@ -151,17 +130,12 @@ def test_each_half_moves_with_its_own_twist():
     assert np.abs(moved[:, 1:]).max() < 1e-9
 
 
-@pytest.fixture(scope="module")
-def few(raw):
-    return [subsample(s, 12_000) for s in raw]
-
-
-def test_few_points_are_laid_on_the_surfaces_of_the_last_second(drive, few):
-    (found, points), true = register_on_surfaces(few), drive.trajectory(FRAMES)
+def test_few_points_are_laid_on_the_surfaces_of_the_last_second(drive, raw):
+    few, true = [subsample(s, 12_000) for s in raw], drive.trajectory(FRAMES)
+    found, points = register_on_surfaces(few)
     assert [len(p) for p in points] == [len(s) for s in few]
     off_m, off_deg = errors(replace(true, T_world_lidar=found), true)
     assert off_m.max() < 0.04 and off_deg.max() < 0.1
-    assert register_on_surfaces(few)[0].tobytes() == found.tobytes()
 
 
 def test_the_road_ahead_does_not_tip_a_scanner_of_few_rings() -> None:
@@ -226,13 +200,3 @@ def test_jumps_name_their_frames(drive, twist, what):
     with pytest.raises(ComputationError, match=what) as caught:
         check_plausible(moved(drive.trajectory(FRAMES), 6, twist), SETTINGS)
     assert "\n" not in str(caught.value)
-
-
-def test_guard_rails_do_not_look_like_standing_still() -> None:
-    """Rails along the road are met by the same rays in every sweep, more so at a high rate: sweeps
-    0.05 s apart do not tell 20 m/s from the 25 that are driven."""
-    street, settings = Street("highway", 23, "hdl64", hz=20), RegisterSettings()
-    sweeps = [read_sweep(street, frame, settings) for frame in range(205, 210)]
-    found = find_trajectory(sweeps, settings)
-    driven_m = np.linalg.norm(found.T_world_lidar[-1][:3, 3] - found.T_world_lidar[0][:3, 3])
-    assert driven_m / 0.2 == pytest.approx(25, abs=1)

@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from densify.free_space.range_image import RangeImage
-from densify.free_space.rays import aim_rays, find_rings, fires_by_azimuth
-from densify.free_space.sensor import SensorModel, Sensors
+from densify.free_space.sensor import SensorModel, Sensors, aim_rays, find_rings, fires_by_azimuth
 from densify.geometry.types import RegisteredSweep, Sweep
 from densify.readers import checks
 from densify.street.lidar import SENSORS, Spinning

@@ -17,16 +17,10 @@ from densify.geometry.types import Bool, Float, Float32, Int, Stretch, Sweep
 
 ABOVE_GROUND_M = 0.2
 """Height above the ground below which points are part of it and never start a moving object."""
-_BELOW_M = 0.5  # points this far below the ground are no surface: mirror images, multipath
-_OUTLIER_SHARE = 0.02  # largest share of the points of a cell that are mirror images or noise
-_DENSE_M = 30.0  # range within which every sweep measures the ground
 _MOST_CELLS = 1 << 18  # largest grid, 512 m x 512 m
-CELL_M = 1.0  # side of a cell; smaller cells follow kerbs, larger ones bridge holes
-MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
+_CELL_M = 1.0  # side of a cell; smaller cells follow kerbs, larger ones bridge holes
+_MAX_SLOPE = 0.15  # rise per metre; steeper surfaces are objects
 _WINDOW = 7  # width in cells; a narrower hump or pit is not ground
-
-_NUM_POINTS, _NUM_PLANES = 2000, 200  # points and sampled planes of RANSAC
-_LEAST_SHARE = 0.1  # share of points on a ground plane minus share of points below it
 
 
 def ground(stretch: Stretch) -> HeightMap:
@@ -53,27 +47,27 @@ class HeightMap:
         The ground of a cell is the median over the clouds of the lowest points, without mirror
         images from below the road. A limit on the slope removes cars and walls.
         """
-        gridded = _drop_far_points(clouds)
-        low_m, shape = _grid_around(gridded)
+        gridded, low_m, shape = _fit_grid(clouds)
         cells = [_cells_of(points, low_m, shape[1]) for points in gridded]
         heights = _median_of_lowest(gridded, cells, shape[0] * shape[1]).reshape(shape)
 
         is_measured = np.isfinite(heights)
-        nearest_cell = tuple(
-            ndimage.distance_transform_edt(
-                ~is_measured, return_distances=False, return_indices=True
-            )
-        )
+        nearest_cell = tuple(ndimage.distance_transform_edt(~is_measured, return_indices=True)[1])
         # A cell lower than the greatest slope allows over half a window is a mirror image.
         median_m = ndimage.median_filter(heights[nearest_cell], _WINDOW)
-        rise_m = MAX_SLOPE * CELL_M
+        rise_m = _MAX_SLOPE * _CELL_M
         is_pit = is_measured & (heights < median_m - rise_m * (_WINDOW // 2))
         heights = np.where(is_pit, median_m, heights)
+        heights = _limit_slope(heights, rise_m)[nearest_cell]
 
+        # Narrow humps, such as a vehicle that is always parked, are removed. Slopes and kerbs stay.
+        # Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing
+        # Nonground Measurements from Airborne LIDAR Data", TGRS 2003.
+        opened = ndimage.grey_opening(heights, (_WINDOW, _WINDOW))
+        hull_m = np.where(heights - opened > ABOVE_GROUND_M, opened, heights)
         # The hull is a lower bound of the ground, which is the mean of the points close to it.
-        heights = _limit_slope(heights, rise_m)
-        hull = HeightMap(_remove_humps(heights[nearest_cell]), low_m, CELL_M)
-        return HeightMap(_average_heights(hull, gridded, cells), low_m, CELL_M)
+        hull = HeightMap(hull_m, low_m, _CELL_M)
+        return HeightMap(_average_heights(hull, gridded, cells), low_m, _CELL_M)
 
     def under(self, points: Float) -> Float:
         """Return (N,) ground heights, metres, at points (N,2 or 3); beyond the grid its edge's."""
@@ -95,9 +89,11 @@ class HeightMap:
 
     def below(self, points: Float, T_world_lidar: Float) -> Bool:
         """Return (N,) True for points (N,3, lidar frame) within 30 m clearly below the ground."""
-        rows = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < _DENSE_M)
+        # Farther away not every sweep measures the ground. Returns from 0.5 m below it are mirror
+        # images or multipath.
+        rows = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < 30.0)
         is_below = np.zeros(len(points), bool)
-        is_below[rows] = self.above(poses.transform(T_world_lidar, points[rows])) < -_BELOW_M
+        is_below[rows] = self.above(poses.transform(T_world_lidar, points[rows])) < -0.5
         return is_below
 
 
@@ -117,39 +113,32 @@ def _interpolate(begin, end, points, heights_m, low_m, cell_m, ground_m):  # typ
         ground_m[i] = (1 - x) * near_m + x * far_m
 
 
-def _drop_far_points(clouds: Sequence[Float]) -> list[Float]:
-    """Return the clouds (N,3) without the few points that are too far away for a grid."""
-    low_m, high_m = _bounds(clouds)
-    if np.prod((high_m - low_m) / CELL_M + 1) <= _MOST_CELLS:  # without a copy of all points
-        return list(clouds)
-    in_grid = bulk(np.concatenate([points[:, :2] for points in clouds]), CELL_M, _MOST_CELLS)
-    ends = np.cumsum([len(points) for points in clouds])[:-1]
-    masks = np.split(in_grid, ends)
-    return [points[mask] for points, mask in zip(clouds, masks, strict=True)]
+def _fit_grid(clouds: Sequence[Float]) -> tuple[list[Float], Float, tuple[int, int]]:
+    """Return the clouds (N,3) without the few points too far away for a grid, and that grid.
 
+    The grid is given by its (2,) lower corner in metres and its numbers of cells.
+    """
 
-def _bounds(clouds: Sequence[Float]) -> tuple[Float, Float]:
-    """Return the (2,) least and the (2,) greatest x and y of all points."""
-    low_m = np.array(
-        [min(points[:, axis].min(initial=np.inf) for points in clouds) for axis in (0, 1)]
-    )
-    high_m = np.array(
-        [max(points[:, axis].max(initial=-np.inf) for points in clouds) for axis in (0, 1)]
-    )
-    return low_m, high_m
+    def find_bounds(clouds: Sequence[Float]) -> tuple[Float, Float]:
+        low_m = [min(points[:, k].min(initial=np.inf) for points in clouds) for k in (0, 1)]
+        high_m = [max(points[:, k].max(initial=-np.inf) for points in clouds) for k in (0, 1)]
+        return np.array(low_m), np.array(high_m)
 
-
-def _grid_around(clouds: Sequence[Float]) -> tuple[Float, tuple[int, int]]:
-    """Return the (2,) lower corner of a grid around all points, and its numbers of cells."""
-    low_m, high_m = _bounds(clouds)
-    low_m = np.floor(low_m / CELL_M) * CELL_M
-    num_x, num_y = ((high_m - low_m) / CELL_M).astype(np.int64) + 1
-    return low_m, (int(num_x), int(num_y))
+    gridded = list(clouds)
+    low_m, high_m = find_bounds(gridded)
+    if np.prod((high_m - low_m) / _CELL_M + 1) > _MOST_CELLS:
+        in_grid = bulk(np.concatenate([points[:, :2] for points in clouds]), _CELL_M, _MOST_CELLS)
+        masks = np.split(in_grid, np.cumsum([len(points) for points in clouds])[:-1])
+        gridded = [points[mask] for points, mask in zip(clouds, masks, strict=True)]
+        low_m, high_m = find_bounds(gridded)
+    low_m = np.floor(low_m / _CELL_M) * _CELL_M
+    num_x, num_y = ((high_m - low_m) / _CELL_M).astype(np.int64) + 1
+    return gridded, low_m, (int(num_x), int(num_y))
 
 
 def _cells_of(points: Float, low_m: Float, num_y: int) -> Int:
     """Return the (N,) number of each point's grid cell; a row of the grid has ``num_y`` cells."""
-    x, y = (((points[:, axis] - low_m[axis]) / CELL_M).astype(np.int64) for axis in (0, 1))
+    x, y = (((points[:, axis] - low_m[axis]) / _CELL_M).astype(np.int64) for axis in (0, 1))
     return x * num_y + y
 
 
@@ -163,8 +152,9 @@ def _median_of_lowest(clouds: Sequence[Float], cells: Sequence[Int], num_cells: 
         order = np.argsort(cell + scaled_height)
         first = np.flatnonzero(np.diff(cell[order], prepend=-1))  # lowest point of each cell
         num_points = np.diff(first, append=len(order))
-        # The lowest points may be outliers; at least one is passed over, if the cell has two.
-        num_outliers = np.maximum(1, (_OUTLIER_SHARE * num_points).astype(int))
+        # Up to 2 % of the points of a cell are mirror images or noise. At least the lowest one is
+        # passed over, if the cell has two.
+        num_outliers = np.maximum(1, (0.02 * num_points).astype(int))
         ground_row = order[first + np.minimum(num_points - 1, num_outliers)]
         cloud_lowest_m[cell[order[first]]] = z[ground_row]
     is_measured = ~np.isnan(lowest_m).all(axis=0)
@@ -176,32 +166,19 @@ def _median_of_lowest(clouds: Sequence[Float], cells: Sequence[Int], num_cells: 
 def _average_heights(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) -> Float:
     """Return the (X,Y) mean height of the points close to the hull around each cell."""
     # The hull is lower where more points were measured: an object driving there would climb.
-    sum_m = np.zeros(hull.heights_m.size)
-    num_points = np.zeros(hull.heights_m.size)
+    sum_m, num_points = np.zeros((2, hull.heights_m.size))
     for points, cell in zip(clouds, cells, strict=True):
         above_hull_m = points[:, 2] - hull.under(points)
-        rows = np.flatnonzero(np.abs(above_hull_m) < MAX_SLOPE * CELL_M)
+        rows = np.flatnonzero(np.abs(above_hull_m) < _MAX_SLOPE * _CELL_M)
         np.add.at(num_points, cell[rows], 1)
         np.add.at(sum_m, cell[rows], above_hull_m[rows])
-    shape = hull.heights_m.shape
-    sum_m = _sum_3x3(sum_m.reshape(shape))
-    num_points = _sum_3x3(num_points.reshape(shape))
+    # Sums over each cell and its eight neighbours
+    sum_m, num_points = (
+        9 * ndimage.uniform_filter(values.reshape(hull.heights_m.shape), 3, mode="constant")
+        for values in (sum_m, num_points)
+    )
     mean_m: Float = hull.heights_m + sum_m / np.maximum(num_points, 1)
     return mean_m
-
-
-def _sum_3x3(values: Float) -> Float:
-    """Return the (X,Y) sums of each cell and its eight neighbours."""
-    mean: Float = ndimage.uniform_filter(values, 3, mode="constant")
-    return mean * 9
-
-
-def _remove_humps(heights: Float) -> Float:
-    """Remove narrow humps, such as a vehicle that is always parked. Slopes and kerbs stay."""
-    # Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing
-    # Nonground Measurements from Airborne LIDAR Data", TGRS 2003.
-    opened = ndimage.grey_opening(heights, (_WINDOW, _WINDOW))
-    return np.where(heights - opened > ABOVE_GROUND_M, opened, heights)
 
 
 def _limit_slope(heights: Float, rise_m: float) -> Float:
@@ -221,24 +198,16 @@ def find_upright(sweeps: Sequence[Sweep]) -> Float:
     RANSAC (Fischler, Bolles, 1981) finds the ground plane: most points are on it, few below it.
     Without one the result is the identity. Slopes below 0.075 are not levelled.
     """
-    stride = sum(map(len, sweeps)) // _NUM_POINTS + 1
+    stride = sum(map(len, sweeps)) // 2000 + 1
     points = np.concatenate([sweep.points[::stride] for sweep in sweeps])
-    as_measured = np.eye(3)
-    turned_over = np.diag([1.0, -1.0, -1.0])
-    for R_turned_lidar in (as_measured, turned_over):
+    for R_turned_lidar in (np.eye(3), np.diag([1.0, -1.0, -1.0])):  # as measured, and upside down
         up = _ground_normal(points @ R_turned_lidar.T)
-        if up is not None:
-            return _rotation_to_z(up) @ R_turned_lidar
+        if up is None:
+            continue
+        if np.hypot(*up[:2]) < 0.5 * _MAX_SLOPE * up[2]:  # the slope may be the road's own
+            return R_turned_lidar
+        return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix() @ R_turned_lidar
     return np.eye(3)
-
-
-def _rotation_to_z(up: Float) -> Float:
-    """Return the smallest rotation (3,3) that turns a unit vector (3,) to z."""
-    # A slope of 0.075 may be the road's own.
-    if np.hypot(*up[:2]) < 0.5 * MAX_SLOPE * up[2]:
-        return np.eye(3)
-    R: Float = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
-    return R
 
 
 def _ground_normal(points: Float) -> Float | None:
@@ -248,9 +217,8 @@ def _ground_normal(points: Float) -> Float | None:
 
     # Planes through random triples of points, with the normal upwards
     rng = np.random.default_rng(0)
-    corner_a, corner_b, corner_c = points[
-        rng.integers(len(points), size=(_NUM_PLANES, 3))
-    ].transpose(1, 0, 2)
+    corners = points[rng.integers(len(points), size=(200, 3))]
+    corner_a, corner_b, corner_c = corners.transpose(1, 0, 2)
     normal = np.cross(corner_b - corner_a, corner_c - corner_a)
     normal *= np.where(normal[:, 2:] < 0, -1, 1)
     is_floor = normal[:, 2] > np.hypot(*normal[:, :2].T)  # a floor and not a wall
@@ -263,7 +231,7 @@ def _ground_normal(points: Float) -> Float | None:
     share_on = np.where(plane_z_m < 0, on_plane.mean(axis=0), 0)
     share_below = (height_m < -ABOVE_GROUND_M).mean(axis=0)
     score = share_on - share_below
-    if score.max(initial=0) < _LEAST_SHARE:
+    if score.max(initial=0) < 0.1:
         return None
 
     # The normal is the direction in which the points of the plane vary least.

@@ -14,17 +14,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from densify.free_space.rays import (
+from densify.free_space.sensor import (
     BLOCK,
     FEW_POINTS,
+    PI,
+    ZERO,
     AimedRays,
-    Layout,
+    Sensors,
     aim_rays,
     azimuth_of,
     fires_by_azimuth,
@@ -32,7 +34,6 @@ from densify.free_space.rays import (
     move_to_scanner,
     move_to_time,
 )
-from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel, inlined, num_threads
@@ -43,22 +44,10 @@ REACH_S = 1.0
 FREE_MARGIN = 0.4, 0.015
 """Least distance of a return beyond a seen-through point: the larger of metres, share of range."""
 _CELLS_PER_STEP = 1.15  # a cell a little larger than a step is rarely empty
-_MIN_ROW_RAD = np.deg2rad(0.45)  # least height of a row for near points
-# Rings closer than this always share a row. Other rings have their own rows from the range at
-# which three rings span more than `_SLACK_M`, the error of registration.
-_MIN_FAR_ROW_RAD, _SLACK_M = np.deg2rad(0.15), 0.1
-# A ring this far from all others observes free space only at its rays. Three full cells suffice.
-_LONE_RAD = np.deg2rad(1.0)
-_TIME_SHARE = 0.1  # two estimates of a firing time agree within this share of a turn
-_MIN_COLUMNS, _MAX_COLUMNS = 90, 8192
-# Percentile of the ray spacings of an unordered scanner that is the size of its finest cells
-_FINEST_PERCENT = 10
 _MIN_FILLED = 6  # least number of filled cells among the 3 x 3 around a direction
-# An unordered scanner gets larger cells, of up to `_MAX_SIZES` sizes, until this share of its
-# returns has enough filled cells.
-_MIN_TESTABLE, _MAX_SIZES = 0.8, 5
+# Rings closer than this always share a row. Other rings have their own rows for far points.
+_MIN_FAR_ROW_RAD = np.deg2rad(0.15)
 _PENALTY = 1000  # of a return that is not beyond the point; above the sum of all cells counted
-_PI, _ZERO = np.float32(np.pi), np.float32(0)  # float32, as all numbers in the kernels
 
 
 class ScannerImage(NamedTuple):
@@ -98,10 +87,15 @@ class RangeImage:
             by_ring: True also uses single rings: dense rings for far points, where an error of
                 registration is smaller than their spacing, and isolated rings at their rays.
         """
-        scanners: list[ScannerImage] = []
+        images: list[ScannerImage] = []
         for lidar in np.unique(registered.sweep.lidar).tolist():
-            scanners += _scanner_images(registered, lidar, num_together, by_ring)
-        return RangeImage(tuple(scanners))
+            rays = aim_rays(registered, lidar)
+            for cells in _choose_cells(rays, num_together, by_ring):
+                images.append(_make_image(registered, lidar, rays, cells))
+                # Still larger cells would call the gaps between returns free.
+                if cells.may_be_last and _share_testable(images[-1], rays) >= 0.8:
+                    break
+        return RangeImage(tuple(images))
 
     def sees_through(
         self,
@@ -116,14 +110,7 @@ class RangeImage:
         At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return.
         Every return in them must be farther than the point by more than ``max(margin_m,
         margin_fraction * range)``. A larger margin tolerates errors of registration, but misses
-        moving objects close to a background.
-
-        Args:
-            points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
-            margin_m: Least distance in metres of a return beyond the point.
-            margin_fraction: Least distance of a return beyond the point, as a share of its range.
-            min_filled: Least number of filled cells.
-            velocity_m_s: (N,3) lidar frame, without ego-motion; None for static points.
+        moving objects close to a background. All other arguments are those of `count_beyond`.
         """
         margins = margin_m, margin_fraction
         num_beyond = self.count_beyond(points, margins, min_filled, velocity_m_s)
@@ -138,13 +125,9 @@ class RangeImage:
     ) -> NDArray[np.int16]:
         """Return the (S,N) number of filled cells around each of N points in each of S images.
 
-        The 3 x 3 cells around a point's direction are counted. There are three cases:
-
-        - The count is 0 if fewer than ``min_filled`` cells are filled.
-        - It is the number of filled cells if all their returns are beyond the point.
-        - It is far below 0 if any of these returns is not beyond the point.
-
-        The counts of several sweeps may be added.
+        The 3 x 3 cells around a point's direction are counted. The count is 0 if fewer than
+        ``min_filled`` cells are filled, and far below 0 if a return in them is not beyond the
+        point. The counts of several sweeps may be added.
 
         Args:
             points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
@@ -186,9 +169,7 @@ class FreeSpace:
         make_image = partial(RangeImage.of, num_together=max(map(len, batches)), by_ring=True)
         with ThreadPoolExecutor(num_threads()) as pool:
             images = tuple(pool.map(make_image, stretch.sweeps))
-        T_lidar_world = tuple(
-            poses.inverse(registered.T_world_lidar) for registered in stretch.sweeps
-        )
+        T_lidar_world = tuple(poses.inverse(sweep.T_world_lidar) for sweep in stretch.sweeps)
         return FreeSpace(images, T_lidar_world, clock, Sensors.of(stretch.sweeps), batches)
 
     def gap_m(self, position: Float, i: int) -> float:
@@ -204,11 +185,6 @@ class FreeSpace:
             if i not in batch and any(self.clock.near(i, j, REACH_S) for j in batch)
         ]
 
-    @cached_property
-    def _batch_of(self) -> dict[int, tuple[int, ...]]:
-        """Indices of the sweeps in the same batch, by index of the sweep."""
-        return {j: batch for batch in self.batches for j in batch}
-
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
         """Return (N,) True where the batch of sweep j certainly observed free space.
 
@@ -220,14 +196,13 @@ class FreeSpace:
             j: Index of the sweep.
             velocity_m_s: (N,3) velocities in the world frame, None for static points.
         """
-        batch = self._batch_of[j]
+        batch = next(batch for batch in self.batches if j in batch)
         # Of several sweeps the sum must have enough filled cells, and not each of them.
         min_filled = _MIN_FILLED if len(batch) == 1 else 1
         counts = []  # one (S,N) array of `count_beyond` for each sweep of the batch
         for k in batch:
             T_lidar_world = self.T_lidar_world[k]
-            points_k = points
-            velocity_lidar = None
+            points_k, velocity_lidar = points, None
             if velocity_m_s is not None:
                 velocity_lidar = poses.rotate(T_lidar_world, velocity_m_s)
                 if k != j:
@@ -251,28 +226,8 @@ class _Cells(NamedTuple):
     to_m: float = np.inf
     # True if every other row is a single ring, and the rows between hold no ring
     has_lone_rings: bool = False
-    # True if the image is used only where the previous image has too many empty cells
-    is_coarser: bool = False
-
-
-class _Times(NamedTuple):
-    """The times at which a scanner faces the columns (1,C) or the cells (R,C) of an image."""
-
-    offset_s: Float32  # seconds after the reference time, middle of all such times
-    spread_s: Float32  # greatest difference from that time in seconds
-
-
-def _scanner_images(
-    registered: RegisteredSweep, lidar: int, num_together: int, by_ring: bool
-) -> list[ScannerImage]:
-    """Return the images of scanner ``lidar``, finest first; arguments as in `RangeImage.of`."""
-    rays = aim_rays(registered, lidar)
-    images: list[ScannerImage] = []
-    for cells in _choose_cells(rays, num_together, by_ring):
-        if cells.is_coarser and images and _share_testable(images[-1], rays) >= _MIN_TESTABLE:
-            break  # still larger cells would call the gaps between posts free
-        images.append(_make_image(registered, lidar, rays, cells))
-    return images
+    # True if the image is the last one unless too many of its cells are empty
+    may_be_last: bool = False
 
 
 def _make_image(
@@ -280,28 +235,31 @@ def _make_image(
 ) -> ScannerImage:
     """Return the range image of one scanner, made from its rays."""
     sweep = registered.sweep
-    num_rows = len(cells.row_edges_rad) - 1
+    shape = len(cells.row_edges_rad) - 1, cells.num_columns
     row, column = _cell_of(rays, cells.row_edges_rad, cells.num_columns)
     in_rows = np.flatnonzero(row >= 0)
     cell = row[in_rows] * cells.num_columns + column[in_rows]
 
-    nearest_m = np.full((num_rows, cells.num_columns), np.inf, np.float32)
-    np.minimum.at(nearest_m.reshape(-1), cell, rays.range_m[in_rows])
-    num_filled = _join_3x3(np.add, np.isfinite(nearest_m).astype(np.uint8), 0)
+    nearest_m = _reduce_3x3(np.minimum, np.inf, cell, rays.range_m[in_rows], shape)
+    is_filled = np.zeros(shape, np.uint8)
+    is_filled.reshape(-1)[cell] = 1
+    num_filled = _join_3x3(np.add, is_filled, 0)
     if cells.has_lone_rings:
         num_filled[::2] *= 2  # three filled cells of a lone ring count as six
         num_filled[1::2] = 0  # a cell between two lone rings is no evidence
 
     if fires_by_azimuth(rays):
-        offset_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
-        times = _Times(offset_s, np.zeros_like(offset_s))
+        first_s = last_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
     else:
-        times = _times_per_cell(cell, rays.offset_s[in_rows], nearest_m.shape)
+        first_s = _reduce_3x3(np.minimum, np.inf, cell, rays.offset_s[in_rows], shape)
+        last_s = _reduce_3x3(np.maximum, -np.inf, cell, rays.offset_s[in_rows], shape)
+        first_s[np.isinf(first_s)] = last_s[np.isinf(last_s)] = 0  # no ray in the nine cells
+    half = np.float32(0.5)  # stays in float32
     return ScannerImage(
-        offset_s=times.offset_s,
-        spread_s=times.spread_s,
-        max_error_s=_TIME_SHARE * float(np.ptp(rays.offset_s)),
-        nearest_m=_join_3x3(np.minimum, nearest_m, np.inf),
+        offset_s=half * (first_s + last_s),
+        spread_s=half * (last_s - first_s),
+        max_error_s=0.1 * float(np.ptp(rays.offset_s)),  # a tenth of a turn
+        nearest_m=nearest_m,
         num_filled=num_filled,
         row_edges_rad=cells.row_edges_rad,
         origin_m=sweep.origin_m(lidar).astype(np.float32),
@@ -316,8 +274,20 @@ def _cell_of(rays: AimedRays, row_edges_rad: Float32, num_columns: int) -> tuple
     """Return the row (-1 outside) and the column of each ray, (N,) each."""
     row = np.searchsorted(row_edges_rad, rays.elevation, side="right") - 1
     row[row == len(row_edges_rad) - 1] = -1  # above the last edge
-    column = ((rays.azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI))).astype(np.int64)
+    column = ((rays.azimuth + PI) * (np.float32(num_columns) / (PI + PI))).astype(np.int64)
     return row, column % num_columns
+
+
+def _reduce_3x3(
+    join: np.ufunc, empty: float, cell: Int, values: Float32, shape: tuple[int, int]
+) -> Float32:
+    """Return the values (N,) joined over the 3 x 3 cells around each of (R,C), ``empty`` if none.
+
+    ``cell`` (N,) is the flat index of each value's cell.
+    """
+    joined = np.full(shape, empty, np.float32)
+    join.at(joined.reshape(-1), cell, values)
+    return _join_3x3(join, joined, empty)
 
 
 def _join_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> NDArray[Any]:
@@ -330,27 +300,11 @@ def _join_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> ND
 def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Float32:
     """Return the (C,) mean firing time of each column, interpolated in columns without rays."""
     num_rays = np.bincount(column)
-    sum_s = np.bincount(column, offset_s)
     with_rays = np.flatnonzero(num_rays)
     if not len(with_rays):
         return np.zeros(num_columns, np.float32)
-    mean_s = sum_s[with_rays] / num_rays[with_rays]
+    mean_s = np.bincount(column, offset_s)[with_rays] / num_rays[with_rays]
     return np.interp(np.arange(num_columns), with_rays, mean_s).astype(np.float32)
-
-
-def _times_per_cell(cell: Int, offset_s: Float32, shape: tuple[int, ...]) -> _Times:
-    """Return the times of the 3 x 3 cells around each cell (R,C), 0 where none holds a ray."""
-    first_s = np.full(shape, np.inf, np.float32)
-    last_s = np.full(shape, -np.inf, np.float32)
-    np.minimum.at(first_s.reshape(-1), cell, offset_s)
-    np.maximum.at(last_s.reshape(-1), cell, offset_s)
-    first_s = _join_3x3(np.minimum, first_s, np.inf)
-    last_s = _join_3x3(np.maximum, last_s, -np.inf)
-    has_rays = np.isfinite(first_s)
-    first_s = np.where(has_rays, first_s, _ZERO)
-    last_s = np.where(has_rays, last_s, _ZERO)
-    half = np.float32(0.5)  # stays in float32
-    return _Times(offset_s=half * (first_s + last_s), spread_s=half * (last_s - first_s))
 
 
 def _share_testable(image: ScannerImage, rays: AimedRays) -> float:
@@ -362,28 +316,22 @@ def _share_testable(image: ScannerImage, rays: AimedRays) -> float:
 def _choose_cells(rays: AimedRays, num_together: int, by_ring: bool) -> list[_Cells]:
     """Choose the cells of one scanner's images, finest first; arguments as in `RangeImage.of`."""
     if len(rays.azimuth) < FEW_POINTS:  # too few to measure their layout
-        return [_grid(_uniform_edges(rays.elevation, np.deg2rad(2.0)), np.deg2rad(1.0))]
+        return [_uniform_cells(rays, *np.deg2rad([2.0, 1.0]))]
     layout = measure_layout([rays])
-    step_rad = layout.azimuth_step_rad / num_together
+    column_rad = _CELLS_PER_STEP * (layout.azimuth_step_rad / num_together)
     if layout.rings_rad is not None:
-        return _cells_of_rings(layout.rings_rad, _CELLS_PER_STEP * step_rad, by_ring)
+        return _cells_of_rings(layout.rings_rad, column_rad, by_ring)
     if not layout.unordered:
         row_rad = _CELLS_PER_STEP * float(np.median(layout.table.elevation_gap_rad))
-        return [_grid(_uniform_edges(rays.elevation, row_rad), _CELLS_PER_STEP * step_rad)]
-    return _cells_of_unordered(rays, layout)
-
-
-def _cells_of_unordered(rays: AimedRays, layout: Layout) -> list[_Cells]:
-    """Return square cells of several sizes, each twice as large as the one before."""
+        return [_uniform_cells(rays, row_rad, column_rad)]
+    # Square cells of up to five sizes. The finest follow the closest tenth of the rays.
     gap_rad = layout.table.at(rays.azimuth, rays.elevation)[:, 1]
-    finest_rad = _CELLS_PER_STEP * float(np.percentile(gap_rad, _FINEST_PERCENT))
+    finest_rad = _CELLS_PER_STEP * float(np.percentile(gap_rad, 10))
     # A step of azimuth is shorter on the sphere by the cosine of the elevation.
     shortening = float(np.cos(np.median(rays.elevation)))
     return [
-        _grid(_uniform_edges(rays.elevation, side_rad), side_rad / shortening)._replace(
-            is_coarser=True
-        )
-        for side_rad in finest_rad * 2.0 ** np.arange(_MAX_SIZES)
+        _uniform_cells(rays, side_rad, side_rad / shortening)._replace(may_be_last=True)
+        for side_rad in finest_rad * 2.0 ** np.arange(5)
     ]
 
 
@@ -393,26 +341,28 @@ def _cells_of_rings(rings: Float, column_rad: float, by_ring: bool) -> list[_Cel
     # The first and the last ring are in the middle of their rows.
     outer: Float = 2 * rings[[0, -1]] - borders[[0, -1]]
     edges: Float = np.concatenate([outer[:1], borders, outer[1:]])
-    near_cells = _grid(_merge_rows(edges, _MIN_ROW_RAD), column_rad)
+    near_cells = _grid(_merge_rows(edges, 3 * _MIN_FAR_ROW_RAD), column_rad)
     far_edges = _merge_rows(edges, _MIN_FAR_ROW_RAD)
     if by_ring and len(near_cells.row_edges_rad) != len(far_edges):
-        # A point's 3 x 3 cells reach 1.5 rows up and down: from this range on, more than the slack.
-        far_m = _SLACK_M / (1.5 * float(np.diff(far_edges).min()))
+        # A point's 3 x 3 cells reach 1.5 rows up and down. From this range on that is more than the
+        # error of registration, 0.1 m.
+        far_m = 0.1 / (1.5 * float(np.diff(far_edges).min()))
         far_cells = _grid(far_edges, column_rad)
         return [near_cells._replace(to_m=far_m), far_cells._replace(from_m=far_m)]
 
+    # A ring 1 degree from all others observes free space only at its rays. A row is around each
+    # such ring, and a row between two of them.
     gap_rad = np.diff(rings, prepend=-np.inf, append=np.inf)
-    is_lone = np.minimum(gap_rad[:-1], gap_rad[1:]) >= _LONE_RAD
+    is_lone = np.minimum(gap_rad[:-1], gap_rad[1:]) >= np.deg2rad(1.0)
     if not by_ring or not is_lone.any():
         return [near_cells]
-    # a row around each lone ring, and a row between two of them
     lone_edges: Float = rings[is_lone][:, None] + [-_MIN_FAR_ROW_RAD, _MIN_FAR_ROW_RAD]
     return [near_cells, _grid(lone_edges.ravel(), column_rad)._replace(has_lone_rings=True)]
 
 
 def _grid(row_edges_rad: NDArray[np.floating], column_rad: float) -> _Cells:
     """Return cells with these edges of rows (R+1,), and columns of about this width."""
-    num_columns = int(np.clip(round(2 * np.pi / column_rad), _MIN_COLUMNS, _MAX_COLUMNS))
+    num_columns = int(np.clip(round(2 * np.pi / column_rad), 90, 8192))
     return _Cells(row_edges_rad.astype(np.float32), num_columns)
 
 
@@ -426,21 +376,21 @@ def _merge_rows(edges: Float, min_rad: float) -> Float:
     return np.array([*merged[: max(1, len(merged) - 1)], edges[-1]])
 
 
-def _uniform_edges(elevation: Float32, row_rad: float) -> NDArray[np.floating]:
-    """Return the edges (R+1,) of equal rows that cover all elevations and 0."""
+def _uniform_cells(rays: AimedRays, row_rad: float, column_rad: float) -> _Cells:
+    """Return cells in equal rows that cover the elevations of all rays and 0."""
     # The lowest ray is in the middle of its row.
-    low_rad = float(elevation.min(initial=0.0)) - 0.5 * row_rad
-    num_rows = int((float(elevation.max(initial=0.0)) - low_rad) / row_rad) + 1
-    return low_rad + row_rad * np.arange(num_rows + 1)
+    low_rad = float(rays.elevation.min(initial=0.0)) - 0.5 * row_rad
+    num_rows = int((float(rays.elevation.max(initial=0.0)) - low_rad) / row_rad) + 1
+    return _grid(low_rad + row_rad * np.arange(num_rows + 1), column_rad)
 
 
 @inlined
 def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
     """Return the column of an azimuth, 0 for NaN. Columns start behind the scanner."""
-    if not abs(azimuth) <= _PI:  # True for NaN
+    if not abs(azimuth) <= PI:  # True for NaN
         return np.int32(0)
     # 32 bits, because more of them fit into a vector instruction.
-    column = np.int32((azimuth + _PI) * (np.float32(num_columns) / (_PI + _PI)))
+    column = np.int32((azimuth + PI) * (np.float32(num_columns) / (PI + PI)))
     return column - np.int32(num_columns) if column >= num_columns else column
 
 
@@ -482,7 +432,7 @@ def _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation
     # The time gives the position, the position gives the cell, and the cell gives the time. Two
     # iterations from the position at the reference time converge; the third finds the last cell.
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
-    time_s[:size] = _ZERO
+    time_s[:size] = ZERO
     for iteration in range(3):
         for k in range(size):
             i, t = start + k, time_s[k]
@@ -534,7 +484,7 @@ def _count_beyond(begin, end, points, velocity, image, margins, min_filled, num_
             else:
                 # Within the uncertain time the point may have moved.
                 error_s += image.spread_s[r, c]
-                twist = image.twists[0 if time_s[k] < _ZERO else 1]
+                twist = image.twists[0 if time_s[k] < ZERO else 1]
                 speed_m_s = _speed_of(points[i], velocity[min(i, len(velocity) - 1)], twist)
                 margin_m += error_s * speed_m_s
 

@@ -16,31 +16,11 @@ MAP_FRAME_REMEDY = (
 )
 LOST_DEG = 2.0
 """Width without returns from which a sweep is reported, a packet of a fast scanner."""
-_NUM_BINS = 360  # bins of azimuth
-_MEASURED = 0.2  # share of the mean number of returns; a bin with fewer may be empty by chance
-_BLIND_DEG = (3, 90)  # wider gaps are the limits of a scanner's field of view
-
-_CELL_RAD, _CELL_DEPTH = np.radians(2.0), 0.08  # size of a cell; depth as a share of the range
-_USUAL_POINTS = 120_000  # a cell has some 50 rays of a sweep of so many points
-_BLOCK = 8192  # rows of a block
-_MIN_POINTS = 1000  # least number of points of a tested sweep
-_MAX_LONE = 5  # greatest number of returns in the cell of a lone return
-# Greatest share of returns single in their cell in good weather; real sweeps had up to 0.004
-_MAX_SINGLE = 0.007
-
-_RAY_RAD = np.radians(0.4)  # side of a cell of direction in which returns occlude each other
-# A return is occluded if it is farther than the nearest return of its cell: share, metres.
-_BEHIND, _BEHIND_M = 0.15, 1.0
-_STEP_M, _NUM_STEPS = 4.0, 4  # first step of the search; number of steps, each half as long
-_MAX_MOVES = 20  # greatest number of moves with one step
+_STEP_M = 4.0  # first step of the search for the scanner's position
 # Returns occluded from the scanner's position are fewer than this share of those occluded from any
 # other position.
 _MAX_OCCLUDED_RATIO = 0.8
-# Up to this share of returns seems occluded from the scanner itself: silhouettes split beams.
-_AT_SILHOUETTES = 0.01
 _MIN_MOTION_M = 1.0  # least distance between the scanner's positions that shows its motion
-_FLOOR_M = 30.0  # greatest distance of returns that show the floor
-_LOWEST_M, _ROOF_M = 0.5, 1.8  # heights above the floor: lowest scanner, scanner on a car's roof
 
 
 def _directions(points: Float) -> tuple[Float, Float, Float]:
@@ -73,17 +53,18 @@ def remove_lone_returns(sweep: Sweep) -> Sweep:
     cell of direction and logarithm of range. The sweep is returned unchanged if it has few points,
     few returns alone in a cell, or more lone returns than others.
     """
-    if len(sweep) < _MIN_POINTS:
+    if len(sweep) < 1000:
         return sweep
     coordinates = _cell_coordinates(sweep)
-    max_single = _MAX_SINGLE * len(sweep)
+    # In good weather up to 0.4 % of the returns of real sweeps are single in their cell.
+    max_single = 0.007 * len(sweep)
     num_in_cell = _count_in_cells(coordinates)
     if np.count_nonzero(num_in_cell == 1) <= max_single:
         return sweep
     # The larger count of two grids, half a cell apart: a surface may lie on a cell border.
     shift = [[0.0], [0.5], [0.5], [0.5]]  # none between scanners
     num_in_cell = np.maximum(num_in_cell, _count_in_cells(coordinates + shift))
-    is_lone = num_in_cell <= _MAX_LONE
+    is_lone = num_in_cell <= 5
     is_sparse = 2 * np.count_nonzero(is_lone) > len(sweep)
     if np.count_nonzero(num_in_cell == 1) <= max_single or is_sparse:
         return sweep
@@ -93,27 +74,27 @@ def remove_lone_returns(sweep: Sweep) -> Sweep:
 def _cell_coordinates(sweep: Sweep) -> Float:
     """Return the (4,N) scanner, azimuth, elevation and log range of the returns, in cells."""
     origins_m, lidar = sweep.scanner_origins, sweep.lidar
-    # The cells of a sparse scanner are larger: each cell has about as many rays.
-    per_rad = np.sqrt(np.bincount(lidar) / _USUAL_POINTS) / _CELL_RAD
+    # Cells are 2 degrees wide, and 8 % of the range deep. They have some 50 rays of a sweep of
+    # 120,000 points. The cells of a sparser scanner are larger, and have about as many rays.
+    per_rad = np.sqrt(np.bincount(lidar) / 120_000) / np.radians(2.0)
     coordinates = np.empty((4, len(sweep)))
     coordinates[0] = lidar
     # Blocks of rows whose many intermediate results stay in the processor's cache
-    for first in range(0, len(sweep), _BLOCK):
-        rows = slice(first, first + _BLOCK)
+    for first in range(0, len(sweep), 8192):
+        rows = slice(first, first + 8192)
         points = sweep.points[rows]
         if origins_m is not None:
             points = points - origins_m[lidar[rows]]
         azimuth, elevation, range_m = _directions(points)
         coordinates[1:3, rows] = per_rad[lidar[rows]] * [azimuth, elevation]
-        coordinates[3, rows] = np.log(np.maximum(range_m, 1e-3)) / _CELL_DEPTH
+        coordinates[3, rows] = np.log(np.maximum(range_m, 1e-3)) / 0.08
     return coordinates
 
 
 def _count_in_cells(coordinates: Float) -> Int:
     """Return the (N,) number of returns in each return's cell, from `_cell_coordinates` (4,N)."""
     cell = _cell_numbers(coordinates)
-    num_in_cell: Int = np.bincount(cell)[cell]
-    return num_in_cell
+    return np.asarray(np.bincount(cell)[cell], np.int64)
 
 
 # --- lost packets and blind sectors: ground or obstacles surround a vehicle
@@ -121,7 +102,7 @@ def _count_in_cells(coordinates: Float) -> Int:
 
 def count_by_azimuth(sweep: Sweep) -> Int:
     """Return the (360,) number of returns of a raw sweep in each degree of azimuth from -180."""
-    edges_rad = np.linspace(-np.pi, np.pi, _NUM_BINS + 1)
+    edges_rad = np.linspace(-np.pi, np.pi, 361)
     return np.histogram(np.arctan2(sweep.points[:, 1], sweep.points[:, 0]), edges_rad)[0]
 
 
@@ -132,9 +113,9 @@ def lost_deg(returns: Int) -> Float:
     ``returns`` (n,360) are the numbers of returns of each sweep, from `count_by_azimuth`.
     """
     num_usual = np.quantile(returns, 0.75, axis=0)
-    is_lost = (returns == 0) & (num_usual > _MEASURED * num_usual.mean())
-    width_deg: Float = is_lost.sum(axis=1) * (360.0 / _NUM_BINS)
-    return width_deg
+    # A degree with much fewer returns than the mean may be empty by chance.
+    is_lost = (returns == 0) & (num_usual > 0.2 * num_usual.mean())
+    return is_lost.sum(axis=1).astype(np.float64)
 
 
 def blind_sector(returns: Int) -> tuple[int, int] | None:
@@ -144,17 +125,17 @@ def blind_sector(returns: Int) -> tuple[int, int] | None:
     Wider gaps are the limits of the scanner's field of view. ``returns`` (n,360) are the numbers of
     returns of each sweep, from `count_by_azimuth`.
     """
-    measured_bins = np.flatnonzero(returns.any(axis=0))
-    if not len(measured_bins):
+    measured_deg = np.flatnonzero(returns.any(axis=0))
+    if not len(measured_deg):
         return None
-    # From each measured bin to the next, around the circle; neighbours have a gap of 0.
-    gap_deg = np.diff(measured_bins, append=measured_bins[0] + _NUM_BINS) - 1
-    gap_deg[gap_deg > _BLIND_DEG[1]] = 0
+    # From each measured degree to the next, around the circle; neighbours have a gap of 0.
+    gap_deg = np.diff(measured_deg, append=measured_deg[0] + 360) - 1
+    gap_deg[gap_deg > 90] = 0
     widest = int(np.argmax(gap_deg))
-    if gap_deg[widest] < _BLIND_DEG[0]:
+    if gap_deg[widest] < 3:
         return None
-    # The gap begins with the bin after the measured one. Bin 0 is at -180 degrees.
-    begin = int(measured_bins[widest] + 1) % _NUM_BINS - 180
+    # The gap begins after the measured degree. Number 0 is at -180 degrees.
+    begin = int(measured_deg[widest] + 1) % 360 - 180
     return begin, begin + int(gap_deg[widest])
 
 
@@ -190,13 +171,17 @@ def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
     sweeps decide: those whose poses are farthest from the origin, if more than 4 m away, where no
     scanner is mounted.
     """
+    positions = T_world_lidar[:, :3, 3]
     origins = np.stack([sweep.origin_m(0) for sweep in sweeps])
-    distance_m = np.linalg.norm(T_world_lidar[:, :3, 3] - origins, axis=1)
-    return all(
-        distance_m[i] > _STEP_M
-        and _is_scanner(sweeps[i].points, T_world_lidar[i, :3, 3], origins[i])
-        for i in np.argsort(distance_m, kind="stable")[-2:]
-    )
+    distance_m = np.linalg.norm(positions - origins, axis=1)
+    for i in np.argsort(distance_m, kind="stable")[-2:]:
+        if distance_m[i] <= _STEP_M:
+            return False
+        others = [origins[i], *_positions_around(positions[i], _STEP_M, 4)]
+        lowest_share = min(_share_behind(sweeps[i].points, other) for other in others)
+        if _share_behind(sweeps[i].points, positions[i]) >= _MAX_OCCLUDED_RATIO * lowest_share:
+            return False
+    return True
 
 
 def way_in_map(first: Sweep, last: Sweep) -> float:
@@ -205,42 +190,44 @@ def way_in_map(first: Sweep, last: Sweep) -> float:
     It is 0 for sweeps in their scanner's own frame. Sweeps between which odometry finds no motion
     are in the frame of a map if their rays begin apart.
     """
-    origin = _search_start(last)
-    position_last = _find_scanner(last.points[::2], origin)
-    if np.linalg.norm(position_last - origin) < _MIN_MOTION_M:
+    start = _search_start(last)
+    position_last = _find_scanner(last, start)
+    if np.linalg.norm(position_last - start) < _MIN_MOTION_M:
         return 0.0
-    position_first = _find_scanner(first.points[::2], _search_start(first))
+    position_first = _find_scanner(first, _search_start(first))
     distance_m = float(np.linalg.norm((position_last - position_first)[:2]))
     return distance_m if distance_m > _MIN_MOTION_M else 0.0
 
 
-def share_behind(points: Float, origin: Float) -> float:
+def _share_behind(points: Float, origin: Float) -> float:
     """Return the share of points (N,3) that lie behind others, seen from ``origin`` (3,)."""
     azimuth, elevation, range_m = _directions(points - origin)
     has_direction = range_m > 0
     if not has_direction.any():
         return 0.0
     range_m = range_m[has_direction]
+    # Returns occlude each other within cells of 0.4 degrees.
     directions = np.stack([azimuth[has_direction], elevation[has_direction]])
-    cell = _cell_numbers(directions / _RAY_RAD)
+    cell = _cell_numbers(directions / np.radians(0.4))
     nearest_m = np.full(int(cell.max()) + 1, np.inf)
     np.minimum.at(nearest_m, cell, range_m)
-    return float(np.mean(range_m > (1 + _BEHIND) * nearest_m[cell] + _BEHIND_M))
+    return float(np.mean(range_m > 1.15 * nearest_m[cell] + 1.0))
 
 
-def _find_scanner(points: Float, start: Float) -> Float:
+def _find_scanner(sweep: Sweep, start: Float) -> Float:
     """Return the (3,) position, level with ``start`` (3,), from which a sweep was measured."""
     # A descent in steps of 4 m to 0.5 m. A position counts only if clearly fewer returns are
-    # occluded there than at the start, and more than silhouettes explain.
-    start_share = share_behind(points, start)
-    if start_share < _AT_SILHOUETTES:
+    # occluded there than at the start. Silhouettes split beams, hence up to 1 % of the returns seem
+    # occluded from the scanner itself.
+    points = sweep.points[::2]
+    start_share = lowest_share = _share_behind(points, start)
+    if start_share < 0.01:
         return start
     best_position = start
-    lowest_share = start_share
-    for step_m in _STEP_M * 0.5 ** np.arange(_NUM_STEPS):
-        for _ in range(_MAX_MOVES):
+    for step_m in _STEP_M * 0.5 ** np.arange(4):
+        for _ in range(20):
             positions = _positions_around(best_position, step_m, 8)
-            shares = [share_behind(points, position) for position in positions]
+            shares = [_share_behind(points, position) for position in positions]
             if min(shares) >= lowest_share:
                 break
             best_position = positions[int(np.argmin(shares))]
@@ -257,17 +244,9 @@ def _positions_around(position: Float, step_m: float, num: int) -> Float:
 def _search_start(sweep: Sweep) -> Float:
     """Return the origin (3,) of a sweep, raised to a car's roof if it lies on the ground."""
     origin = sweep.origin_m(0)
-    is_near = np.hypot(*(sweep.points - origin)[:, :2].T) < _FLOOR_M
+    is_near = np.hypot(*(sweep.points - origin)[:, :2].T) < 30.0
     if not is_near.any():
         return origin
     floor_m = float(np.percentile(sweep.points[is_near, 2], 10))
-    if origin[2] - floor_m > _LOWEST_M:
-        return origin
-    return np.array([*origin[:2], floor_m + _ROOF_M])
-
-
-def _is_scanner(points: Float, position: Float, origin: Float) -> bool:
-    """Return True if fewer points are occluded from the position than from origin and around."""
-    other_positions = [origin, *_positions_around(position, _STEP_M, 4)]
-    lowest_share = min(share_behind(points, other) for other in other_positions)
-    return share_behind(points, position) < _MAX_OCCLUDED_RATIO * lowest_share
+    is_above_floor = origin[2] - floor_m > 0.5
+    return origin if is_above_floor else np.array([*origin[:2], floor_m + 1.8])

@@ -32,9 +32,7 @@ NEAREST_M = 0.1
 """Least depth of a visible point, in metres."""
 # Possible numbers of coefficients of each model
 _COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
-_RATIONAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # all others are 0
-_NUM_ANGLES = 4096  # samples of a lens from which its inverse is interpolated
-_NUM_ITERATIONS = 10  # greatest number of steps of Newton's method
+_NUM_RATIONAL = 8  # coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a pinhole; all others are 0
 _STEP_RAD = np.cbrt(np.finfo(float).eps)  # step of central differences with the least error
 # Relative residual before the last step of Newton's method, which squares it: then it is exact.
 _CONVERGED = np.sqrt(np.finfo(float).eps)
@@ -59,11 +57,10 @@ def image_points(camera: Camera, points_cam: Float) -> tuple[Float, Bool]:
     Raises:
         InputError: If the lens model is unknown, or its coefficients are wrong in number or value.
     """
-    lens = _lens(camera)
+    lens = _lens(camera.name, camera.model, tuple(camera.distortion))
     uv = np.full((len(points_cam), 2), np.nan)
     visible = np.zeros(len(points_cam), bool)
-    depth_m = points_cam[:, 2] if camera.model == "pinhole" else np.linalg.norm(points_cam, axis=1)
-    rows_ahead = np.flatnonzero(depth_m > NEAREST_M)
+    rows_ahead = np.flatnonzero(depth_along(points_cam, camera.measure) > NEAREST_M)
     points_ahead = points_cam.take(rows_ahead, axis=0)
     in_view = np.flatnonzero(_in_view(camera, lens, points_ahead))
     rows = rows_ahead[in_view]
@@ -80,7 +77,7 @@ def rays(camera: Camera, uv: Float) -> Float:
     Integers are at pixel centres. A pixel outside the view of the lens has NaN. A wrong lens raises
     InputError, as in `image_points`.
     """
-    lens = _lens(camera)
+    lens = _lens(camera.name, camera.model, tuple(camera.distortion))
     plane_xy = (np.column_stack([uv, np.ones(len(uv))]) @ np.linalg.inv(camera.K).T)[:, :2]
     if not camera.is_rectified:
         plane_xy = _undistort(lens, plane_xy)
@@ -96,7 +93,7 @@ def pixels_per_metre(camera: Camera, points_cam: Float) -> Float:
 
     Element [n, i, j] is the change of u (i = 0) or v (i = 1) in pixels per metre along axis j.
     """
-    lens = _lens(camera)
+    lens = _lens(camera.name, camera.model, tuple(camera.distortion))
     range_m = np.linalg.norm(points_cam, axis=1, keepdims=True)
     ray = points_cam / range_m
     # An axis perpendicular to each ray: its product with the coordinate axis farthest from it.
@@ -150,42 +147,34 @@ class _Lens(NamedTuple):
     limit: float  # squared radius up to which the distorted radius grows
 
 
-def _lens(camera: Camera) -> _Lens:
+@lru_cache
+def _lens(name: str, model: str, coef: tuple[float, ...]) -> _Lens:
     """Return the lens of a camera; raise InputError for an unknown model or bad coefficients."""
-    coef = camera.distortion
-    if camera.model not in _COEFFICIENTS:
+    if model not in _COEFFICIENTS:
         raise InputError(
-            f"camera {camera.name}: model: got {camera.model!r}, expected one of "
+            f"camera {name}: model: got {model!r}, expected one of "
             f"{', '.join(_COEFFICIENTS)}; rectify the images if the lens is another"
         )
-    lengths = _COEFFICIENTS[camera.model]
-    if len(coef) not in lengths or not np.isfinite(coef).all() or any(coef[len(_RATIONAL) :]):
-        expected = " or ".join(str(n) for n in lengths if n <= len(_RATIONAL))
+    lengths = _COEFFICIENTS[model]
+    if len(coef) not in lengths or not np.isfinite(coef).all() or any(coef[_NUM_RATIONAL:]):
+        expected = " or ".join(str(n) for n in lengths if n <= _NUM_RATIONAL)
         raise InputError(
-            f"camera {camera.name}: distortion: expected {expected} finite coefficients of a "
-            f"{camera.model} lens in their usual order, any others 0, got {list(coef)}; correct "
+            f"camera {name}: distortion: expected {expected} finite coefficients of a "
+            f"{model} lens in their usual order, any others 0, got {list(coef)}; correct "
             f"the calibration or rectify the images"
         )
-    return _lens_of(camera.model, tuple(coef))
-
-
-@lru_cache
-def _lens_of(model: str, coef: tuple[float, ...]) -> _Lens:
-    """Return the lens of a model with these coefficients."""
-    denominator_terms = [1.0]
+    denominator_terms: tuple[float, ...] = (1.0,)
     p1 = p2 = 0.0
     if model == "fisheye":
-        numerator_terms = [1.0, *coef]
+        numerator_terms = (1.0, *coef)
     elif model == "mei":
-        numerator_terms = [1.0, *coef[1:3]]
-        p1, p2 = coef[3:]
+        _, k1, k2, p1, p2 = coef
+        numerator_terms = (1.0, k1, k2)
     else:
-        padded = (*coef, *[0.0] * len(_RATIONAL))[: len(_RATIONAL)]
-        k1, k2, p1, p2, k3, *k4_to_k6 = padded
-        numerator_terms = [1.0, k1, k2, k3]
-        denominator_terms = [1.0, *k4_to_k6]
-    numerator = Polynomial(numerator_terms)
-    denominator = Polynomial(denominator_terms)
+        k1, k2, p1, p2, k3, *k4_to_k6 = (*coef, *[0.0] * _NUM_RATIONAL)[:_NUM_RATIONAL]
+        numerator_terms = (1.0, k1, k2, k3)
+        denominator_terms = (1.0, *k4_to_k6)
+    numerator, denominator = Polynomial(numerator_terms), Polynomial(denominator_terms)
     limit = _growth_limit(numerator, denominator)
     if model == "fisheye":
         limit = min(limit, np.pi**2)  # the angle off the axis is at most pi
@@ -266,16 +255,15 @@ def _pixels(camera: Camera, lens: _Lens, points_cam: Float) -> Float:
     x, y = _plane(camera, points_cam)
     if not camera.is_rectified:
         x, y = _distort(lens, x, y)
-    u = camera.K[0, 0] * x + camera.K[0, 1] * y + camera.K[0, 2]
-    v = camera.K[1, 1] * y + camera.K[1, 2]
-    return np.column_stack([u, v])
+    K = camera.K
+    return np.column_stack([K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]])
 
 
 def _undistort(lens: _Lens, distorted: Float) -> Float:
     """Return the (N,2) inverse of `_distort`, NaN where the inverse does not exist."""
     # Start from the radial distortion alone, tabulated. The table is even in angle, because the
     # plane of a lens with a half-space view is infinite.
-    radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), _NUM_ANGLES))
+    radius = np.tan(np.linspace(0, np.arctan(np.sqrt(lens.limit)), 4096))
     radius = radius[radius < 1e3]
     distorted_radius = radius * lens.numerator(radius**2) / lens.denominator(radius**2)
     target_radius = np.hypot(*distorted.T)
@@ -286,37 +274,26 @@ def _undistort(lens: _Lens, distorted: Float) -> Float:
         # Newton's method, with the inverse of the symmetric 2 x 2 matrix of slopes
         unsolved = np.arange(len(distorted))
         error = np.full(len(distorted), np.inf)
-        for _ in range(_NUM_ITERATIONS):
+        for _ in range(10):
             residual = np.stack(_distort(lens, *xy[unsolved].T)) - distorted[unsolved].T
-            slopes = _slopes_of(lens, *xy[unsolved].T)
-            column_x = np.stack([slopes.y_by_y, -slopes.x_by_y])
-            column_y = np.stack([-slopes.x_by_y, slopes.x_by_x])
-            determinant = slopes.x_by_x * slopes.y_by_y - slopes.x_by_y**2
+            x_by_x, x_by_y, y_by_y = _slopes_of(lens, *xy[unsolved].T)
+            column_x, column_y = np.stack([y_by_y, -x_by_y]), np.stack([-x_by_y, x_by_x])
             step = column_x * residual[0] + column_y * residual[1]
-            xy[unsolved] -= (step / determinant).T
+            xy[unsolved] -= (step / (x_by_x * y_by_y - x_by_y**2)).T
             error[unsolved] = np.abs(residual).max(axis=0) / (1 + target_radius[unsolved])
             unsolved = unsolved[~(error[unsolved] < _CONVERGED)]  # NaN stays unsolved
         is_solved = (error < _CONVERGED) & ((xy**2).sum(axis=1) < lens.limit)
     return np.where(is_solved[:, None], xy, np.nan)
 
 
-class _Slopes(NamedTuple):
-    """Derivatives of the distorted x and y by the undistorted ones, (N,) each."""
-
-    x_by_x: Float
-    x_by_y: Float  # equal to y by x
-    y_by_y: Float
-
-
-def _slopes_of(lens: _Lens, x: Float, y: Float) -> _Slopes:
-    """Return the slopes of `_distort` at (N,) x and y."""
+def _slopes_of(lens: _Lens, x: Float, y: Float) -> tuple[Float, Float, Float]:
+    """Return derivatives of `_distort` at (N,) x and y: of x by x, of x by y and y by x, y by y."""
     s = x**2 + y**2
     numerator, denominator = lens.numerator(s), lens.denominator(s)
     factor = numerator / denominator
     # twice the derivative of the factor by s
     growth = 2 * (lens.numerator.deriv()(s) - factor * lens.denominator.deriv()(s)) / denominator
-    return _Slopes(
-        x_by_x=factor + growth * x**2 + 2 * lens.p1 * y + 6 * lens.p2 * x,
-        x_by_y=growth * x * y + 2 * (lens.p1 * x + lens.p2 * y),
-        y_by_y=factor + growth * y**2 + 6 * lens.p1 * y + 2 * lens.p2 * x,
-    )
+    x_by_x = factor + growth * x**2 + 2 * lens.p1 * y + 6 * lens.p2 * x
+    x_by_y = growth * x * y + 2 * (lens.p1 * x + lens.p2 * y)
+    y_by_y = factor + growth * y**2 + 6 * lens.p1 * y + 2 * lens.p2 * x
+    return x_by_x, x_by_y, y_by_y

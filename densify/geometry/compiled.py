@@ -125,16 +125,16 @@ class Kernel:
     def __init__(self, function: Callable[..., Any]) -> None:
         self.__doc__ = function.__doc__
         function.__qualname__ += _imported_code(function)  # part of the name of the cache file
-        self._function = function
+        self._compiled = numba.njit(function, **_OPTIONS)
         try:
-            self._compiled = numba.njit(function, **_OPTIONS)
-            self._compiled._cache = _DiskCache(function)  # type: ignore[attr-defined]
+            cache = _DiskCache(function)
         except RuntimeError as error:  # no place for a cache
-            self._do_without_cache(error)
+            _log.debug("%s is compiled without a cache: %s", function.__name__, error)
             return
-        folder = Path(self._compiled.stats.cache_path or "")
-        if folder.parent != Path(function.__code__.co_filename).parent and _is_open(folder):
-            self._do_without_cache(f"others can write to {folder}")
+        folder = Path(cache.cache_path)
+        is_beside_source = folder.parent == Path(function.__code__.co_filename).parent
+        if is_beside_source or not _is_open(folder):
+            self._compiled._cache = cache  # type: ignore[attr-defined]
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the compiled function."""
@@ -157,11 +157,6 @@ class Kernel:
             wait(futures)  # before any error is raised: they write into the caller's arrays
             for future in futures:
                 future.result()
-
-    def _do_without_cache(self, error: Exception | str) -> None:
-        """Compile the function anew, without a cache, and log the reason."""
-        _log.debug("%s is compiled without a cache: %s", self._function.__name__, error)
-        self._compiled = numba.njit(self._function, **_OPTIONS)
 
 
 def num_threads() -> int:

@@ -13,8 +13,6 @@ from scipy.spatial import cKDTree
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 
-_BULK_SHARES = (0.9999, 0.999, 0.99)  # shares of the points that stay, tried in this order
-
 
 def tree_of(points: Float) -> cKDTree:
     """Return the k-d tree of (M,d) points, optimised for fast construction and few queries."""
@@ -84,7 +82,7 @@ def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
     if not len(points) or _num_cells(points, cell) <= most_cells:
         return all_points
     distance = np.abs(points - np.median(points, axis=0)).max(axis=1)
-    for share in _BULK_SHARES:
+    for share in (0.9999, 0.999, 0.99):
         stays = distance <= np.quantile(distance, share)
         if _num_cells(points[stays], cell) <= most_cells:
             return stays
@@ -170,15 +168,7 @@ def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: floa
 
 
 @Kernel
-def _mark_around_dense_seeds(
-    points: Float,
-    seed: Bool,
-    begin: Int,
-    end: Int,
-    within_m2: float,
-    least_share: float,
-    is_close: Bool,
-) -> None:
+def _mark_around_dense_seeds(points, seed, begin, end, within_m2, least_share, is_close):  # type: ignore[no-untyped-def]
     """Mark points (N,3) around dense seeds; seed s is compared with its ranges (S,9) of points."""
     s = -1
     for i in range(len(points)):

@@ -28,8 +28,8 @@ from densify.geometry.types import (
 )
 from densify.pipeline.sweeps import Sweeps
 from densify.readers.timeline import Timeline
-from densify.registration.alignment import Surface
 from densify.registration.deskew import deskew_sweep, twists
+from densify.registration.odometry import Surface
 from densify.registration.road_poses import follow_road, num_in_submap, relax_poses
 
 _STEP_M = 2.0  # usual distance along the road between the sweeps that are used

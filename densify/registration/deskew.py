@@ -59,29 +59,20 @@ def deskew_points(sweep: Sweep, twist: Float) -> Float:
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
     """Return (6,) velocities (rad/s, m/s) before and after sweep i, lidar frame."""
-    last = len(trajectory.frames) - 1
+    T, stamp_ns, last = trajectory.T_world_lidar, trajectory.stamp_ns, len(trajectory.frames) - 1
     if last == 0:  # the velocity of a single sweep is unknown
         return np.zeros(6), np.zeros(6)
-    T = trajectory.T_world_lidar
-
-    def twist_with(neighbour: int) -> Float:
-        seconds = (trajectory.stamp_ns[neighbour] - trajectory.stamp_ns[i]) * 1e-9
-        return poses.twist_between(T[i], T[neighbour], seconds)
-
-    return twist_with(i - 1 if i > 0 else 1), twist_with(i + 1 if i < last else i - 1)
+    before, after = (
+        poses.twist_between(T[i], T[neighbour], (stamp_ns[neighbour] - stamp_ns[i]) * 1e-9)
+        for neighbour in (i - 1 if i > 0 else 1, i + 1 if i < last else i - 1)
+    )
+    return before, after
 
 
 LEAST_SHARPNESS = 4.0  # least sharpness of a scanner with distinct rings
 CLEARLY = 1.25  # least ratio of two sharpnesses that counts as a difference
 LEAST_SPEED_M_S = 1.5  # slower motion does not smear the rings
 COMPENSATED_M = 25.0  # range within which motion during the sweep is visible
-# The HDL-64E of KITTI has two separate blocks of lasers; its rings are sharpest from 0.2 m above.
-_HEIGHTS_M = np.linspace(-0.3, 0.3, 13)
-_NEAR_M = 3.0  # nearer returns may be of the vehicle
-_NUM_POINTS = 20_000  # greatest number of tested returns
-_WINDOW_CELLS = 100  # cells of a window of elevation
-_LEAST_SHARE = 0.01  # least share of all returns in a window that counts
-_BIN_RAD = np.deg2rad(0.02)  # height of the smallest cell
 
 
 class Rings(NamedTuple):
@@ -117,14 +108,15 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     """
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
-    cell = ((elevation + 0.5 * np.pi) / (bins * _BIN_RAD)).astype(np.int64)
-    width = max(8, _WINDOW_CELLS // bins)  # cells of a window
-    num_cells = int(np.pi / (bins * _BIN_RAD) + 1)
+    cell_rad = bins * np.deg2rad(0.02)
+    width = max(8, 100 // bins)  # cells of a window
+    num_cells = int(np.pi / cell_rad + 1)
     num_windows = -(-num_cells // width)  # rounded up
+    cell = ((elevation + 0.5 * np.pi) / cell_rad).astype(np.int64)
     count = np.bincount(cell, minlength=num_windows * width).astype(np.float64)
     count = count.reshape(num_windows, width)
     total = count.sum(axis=1)
-    is_populated = total > _LEAST_SHARE * len(points)
+    is_populated = total > 0.01 * len(points)
     if not is_populated.any():
         return 1.0
     # An even spread has the probability 1 / width.
@@ -160,7 +152,7 @@ def rings_by_motion(
     sharpness_undone = {
         moment: best_sharpness(move(moment_s - offset_s)) for moment, moment_s in moments_s.items()
     }
-    sharpest_moment = max(sharpness_undone, key=lambda moment: sharpness_undone[moment])
+    sharpest_moment = max(sharpness_undone, key=sharpness_undone.__getitem__)
     return Rings(
         as_stored=best_sharpness(points),
         undone=sharpness_undone[sharpest_moment],
@@ -172,8 +164,8 @@ def rings_by_motion(
 def sample_rows(sweep: Sweep, far_m: float) -> Int:
     """Return the rows of at most 20,000 returns of a sweep, from 3 m to ``far_m`` away."""
     range_m = np.linalg.norm(sweep.points, axis=1)
-    rows = np.flatnonzero((range_m > _NEAR_M) & (range_m < far_m))
-    return rows[:: len(rows) // _NUM_POINTS + 1]
+    rows = np.flatnonzero((range_m > 3.0) & (range_m < far_m))  # nearer may be the vehicle
+    return rows[:: len(rows) // 20_000 + 1]
 
 
 def turning_s(points: Float, period_s: float) -> Float:
@@ -204,7 +196,10 @@ def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | Non
             offset_s = turning_s(returns.points[rows], period_s)
         else:
             offset_s = np.asarray(returns.offset_ns[rows] * 1e-9, np.float64)
-        origins_m = [R @ returns.origin_m(lidar) + [0.0, 0.0, height_m] for height_m in _HEIGHTS_M]
+        # The HDL-64E of KITTI has two separate blocks of lasers. Its rings are sharpest from 0.2 m
+        # above.
+        heights_m = np.linspace(-0.3, 0.3, 13)
+        origins_m = [R @ returns.origin_m(lidar) + [0.0, 0.0, height_m] for height_m in heights_m]
         rings = rings_by_motion(returns.points[rows], offset_s, twist, R, origins_m)
         if rings.are_compensated:
             return rings

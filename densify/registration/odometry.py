@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""Register sweeps, point to plane, on the surfaces of the preceding second.
+"""Align surfaces by small_gicp, and register sweeps on the surfaces of the preceding second.
 
-KISS-ICP (Vizzo et al., RA-L 2023) predicts the motion of dense sweeps. It matches a sweep with the
-scan pattern of earlier ones: a rosette that turns 7 degrees a sweep turns these poses with it.
-Surface normals of one second do not depend on the pattern (Chen, Medioni, "Object modelling by
-registration of multiple range images", IVC 1992).
+Segal et al., "Generalized-ICP", RSS 2009; Koide, "small_gicp", JOSS 2024. KISS-ICP (Vizzo et al.,
+RA-L 2023) predicts the motion of dense sweeps. It matches a sweep with the scan pattern of earlier
+ones: a rosette that turns 7 degrees a sweep turns these poses with it. Surface normals of one
+second do not depend on the pattern (Chen, Medioni, "Object modelling by registration of multiple
+range images", IVC 1992).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import small_gicp
 from scipy.spatial import cKDTree
 
 from densify.config import RegisterSettings
@@ -21,25 +23,95 @@ from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.nearest import tree_of
 from densify.geometry.types import Float, Int, Sweep
-from densify.registration.alignment import FEW_POINTS, Surface, align, subsample, thin
 from densify.registration.deskew import deskew_points
 
+MANY_POINTS = 30_000  # points of a sweep that makes a surface
+FEW_POINTS = 15_000  # points of a sweep that is aligned
 _SURFACE_NS = 1_050_000_000  # 1 s, with a tolerance for irregular stamps
-_MAX_SURFACE_SWEEPS = 10  # sweeps of the preceding second; a larger number is thinned evenly
 # A pattern that does not repeat fills its field of view in this time. The surface of one sweep
 # therefore serves the sweeps of this time too.
 FRESH_NS = 350_000_000
+MAX_SPEED_M_S = 60.0  # a faster step between two sweeps is an error of registration
 _NUM_START = 3  # sweeps that make the first surface, at their predicted poses
 _VOXEL_M = 0.25  # voxel in which surfaces and aligned sweeps keep one point
-# Neighbours must include the next rings. Points of one ring give normals of noise, which lean
-# towards the scanner and tilt the vehicle by 0.03 degrees a sweep.
-_NUM_NEIGHBORS, _NUM_NEIGHBORS_OF_FEW = 20, 50
-# One distance per round. The last is narrow, because points outside the target have no match.
-_MATCH_M = (0.5, 0.2)
-_MATCH_UNPREDICTED_M = (0.9, *_MATCH_M)  # constant velocity is up to 0.3 m off after 0.1 s
 # Damping: the information of one match in a hundred, 10 m away, for a motion of zero. It keeps a
 # sweep in place along highways, where one plane in fifty constrains the motion.
 _DAMPING = np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
+
+
+def subsample(sweep: Sweep, max_points: int = MANY_POINTS) -> Sweep:
+    """Return about ``max_points`` points of a larger sweep, spread evenly over its rings."""
+    num = len(sweep)
+    if num <= max_points:
+        return sweep
+    # The multiples of the golden ratio, modulo 1, are spread evenly in [0, 1). Points below a
+    # threshold are therefore an even sample of each ring, in any order of the rings.
+    fraction = np.arange(num) * 0.6180339887498949
+    fraction -= np.floor(fraction)
+    return sweep.select(fraction < max_points / num)
+
+
+class Surface(NamedTuple):
+    """Points thinned to voxels, with the normal and covariance of each point's neighbours."""
+
+    points: Any  # a ``PointCloud`` of small_gicp, in metres
+    tree: Any  # the k-d tree of these points
+
+    @staticmethod
+    def of(points: Float, voxel_m: float = 0.5, num_neighbors: int = 10) -> Surface:
+        """Return the surface of points (N,3), one per voxel, with normals, in their frame."""
+        return Surface(*small_gicp.preprocess_points(points, voxel_m, num_neighbors, 1))
+
+    @staticmethod
+    def of_sweep(sweep: Sweep) -> Surface:
+        """Return the surface of a deskewed sweep, in its lidar frame."""
+        return Surface.of(subsample(sweep).points)
+
+
+class Alignment(NamedTuple):
+    """The alignment of a source with a target surface."""
+
+    T_target_source: Float  # (4,4) pose of the source in the target's frame
+    overlap: float  # share of the source's points with a match in the target
+    # (6,6) matrix of a quadratic form. For a small motion x (rad, m) of the source in its own
+    # frame, ``x @ information @ x`` is the mean square distance (m²) of the source from the target.
+    information: Float
+
+
+def make_map() -> Any:
+    """Return an empty map of surfaces, a ``GaussianVoxelMap`` of small_gicp with 1 m voxels.
+
+    Koide et al., "Voxelized GICP for Fast and Accurate 3D Point Cloud Registration", ICRA 2021.
+    """
+    return small_gicp.GaussianVoxelMap(1.0)
+
+
+def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
+    """Align a source with a target, and return the alignment.
+
+    A source `Surface` is aligned by generalized ICP, other points are aligned point to plane.
+
+    Args:
+        target: A `Surface`, or a map (`make_map`) of surfaces.
+        source: A `Surface`, or a ``PointCloud`` without covariances, in its own frame.
+        T_target_source: (4,4) initial pose of the source.
+        match_m: Greatest distance in metres between corresponding points.
+    """
+    is_surface = isinstance(source, Surface)
+    points = source.points if is_surface else source
+    options: dict[str, Any] = {"max_correspondence_distance": match_m, "num_threads": 1}
+    if isinstance(target, Surface):
+        kind = "GICP" if is_surface else "PLANE_ICP"
+        fit = small_gicp.align(target.points, points, target.tree, T_target_source, kind, **options)
+    else:
+        fit = small_gicp.align(target, points, T_target_source, **options)
+    # H is a sum over matches. Generalized ICP divides squared distances by the variance of both
+    # surfaces along the normal, whose standard deviation is 0.0447 m.
+    num_matches = max(int(fit.num_inliers), 1)
+    scale_m2 = 0.0447**2 if is_surface else 1.0
+    information = np.asarray(fit.H) * scale_m2 / num_matches
+    overlap = fit.num_inliers / max(int(points.size()), 1)
+    return Alignment(np.asarray(fit.T_target_source), overlap, information)
 
 
 def register_on_surfaces(
@@ -58,9 +130,9 @@ def register_on_surfaces(
         The (S,4,4) poses in the frame of the first sweep, and (N,3) deskewed points of each sweep
             in that frame, at most about 15,000.
     """
+    series = _SweepSeries(sweeps, twists)
     if twists is not None:
-        return _SweepSeries(sweeps, _NUM_NEIGHBORS, _MATCH_M).register(twists[0], twists)
-    series = _SweepSeries(sweeps, _NUM_NEIGHBORS_OF_FEW, _MATCH_UNPREDICTED_M)
+        return series.register(twists[0])
     if len(sweeps) == 1:
         return series.register(np.zeros(6))
     # The searched velocity may be wrong by some m/s. The first second is therefore registered once
@@ -68,8 +140,7 @@ def register_on_surfaces(
     searched_twist = search_twist(series.stamp_ns, [sweep.points for sweep in sweeps])
     end_ns = series.stamp_ns[0] + _SURFACE_NS
     num = int(np.searchsorted(series.stamp_ns, end_ns, side="right"))
-    first_second = _SweepSeries(sweeps[:num], _NUM_NEIGHBORS_OF_FEW, _MATCH_UNPREDICTED_M)
-    T, _ = first_second.register(searched_twist)
+    T, _ = _SweepSeries(sweeps[:num], None).register(searched_twist)
     # The first step between two sweeps that were both aligned with earlier ones
     first_aligned_step = min(_NUM_START + 1, len(T) - 1)
     return series.register(poses.twist_to(T, series.stamp_ns, first_aligned_step))
@@ -86,70 +157,62 @@ class _PosedSurface(NamedTuple):
 class _SweepSeries:
     """Raw sweeps, ascending in time, that are aligned with each other."""
 
-    def __init__(
-        self, sweeps: Sequence[Sweep], num_neighbors: int, match_m: Sequence[float]
-    ) -> None:
-        """Prepare the sweeps, with matches up to ``match_m`` for each round of alignment."""
-        self._sweeps = [subsample(sweep, FEW_POINTS) for sweep in sweeps]
+    def __init__(self, sweeps: Sequence[Sweep], twists: Float | None) -> None:
+        """Prepare S sweeps, with predicted velocities (S,6) of the steps to them, if known."""
         self.stamp_ns = np.array([sweep.stamp_ns for sweep in sweeps], np.int64)
-        self._step_s = np.diff(self.stamp_ns) * 1e-9
-        self._num_neighbors = num_neighbors
-        self._match_m = match_m
+        self._sweeps = [subsample(sweep, FEW_POINTS) for sweep in sweeps]
+        self._twists = twists
+        # Greatest distance of a match in each round of alignment. Constant velocity is up to 0.3 m
+        # off after 0.1 s. The last is narrow, because points outside the target have no match.
+        self._match_m = (0.9, 0.5, 0.2) if twists is None else (0.5, 0.2)
+        # Neighbours must include the next rings. Points of one ring give normals of noise, which
+        # lean towards the scanner and tilt the vehicle by 0.03 degrees a sweep.
+        self._num_neighbors = 50 if twists is None else 20
         self._T: Float = np.tile(np.eye(4), (len(sweeps), 1, 1))  # (S,4,4) poses in the world
         # (N,3) deskewed points, in the world, of the sweeps aligned at least once
         self._points: dict[int, Float] = {}
         self._surface: _PosedSurface | None = None  # the surface in use
 
-    def register(self, twist: Float, twists: Float | None = None) -> tuple[Float, list[Float]]:
+    def register(self, twist: Float) -> tuple[Float, list[Float]]:
         """Return the poses and points of `register_on_surfaces`, from an initial velocity (6,)."""
         # The first sweeps have too few sweeps before them for a surface. They keep their
         # predictions, until the sweeps after them are aligned.
         num = len(self._sweeps)
         num_start = min(_NUM_START, num // 2)
-        self._register_forwards(num_start, twist, twists)
+        self._points[0] = deskew_points(self._sweeps[0], twist)
+        for i in range(1, num):
+            twist = self._align_sweep(i, i - 1, twist, is_predicted=i < num_start)
         if num > 2:
-            self._reregister_start(num_start, twists)
+            # The step to sweep num_start + 1 is the first one between two aligned sweeps.
+            twist = poses.twist_to(self._T, self.stamp_ns, num_start + 1)
+            self._surface = None  # the surface in use is of later sweeps
+            for i in range(num_start - 1, -1, -1):
+                twist = self._align_sweep(i, i + 1, twist)
         # From the world of the alignment to the frame of the first sweep, whose pose is exactly I
         T_first_world = poses.inverse(self._T[0])
         points = [poses.transform(T_first_world, self._points[i]) for i in range(num)]
         return np.stack([np.eye(4), *(T_first_world @ T for T in self._T[1:])]), points
 
-    def _register_forwards(self, num_start: int, twist: Float, twists: Float | None) -> None:
-        """Predict the first sweeps, and align the later ones with the sweeps before them."""
-        self._points[0] = deskew_points(self._sweeps[0], twist)
-        for i in range(1, len(self._sweeps)):
-            twist = twist if twists is None else twists[i]
-            T_guess = self._T[i - 1] @ poses.exp(twist * self._step_s[i - 1])
-            # The sweeps of the preceding second, at least one, the nearest first
-            begin_ns = self.stamp_ns[i] - _SURFACE_NS
-            first = min(int(np.searchsorted(self.stamp_ns, begin_ns)), i - 1)
-            neighbours = range(i - 1, first - 1, -1) if i >= num_start else range(0)
-            twist = self._align_sweep(i, i, T_guess, twist, neighbours)
-
-    def _reregister_start(self, num_start: int, twists: Float | None) -> None:
-        """Align the first sweeps, the last one first, with the sweeps after them."""
-        # The step to sweep num_start + 1 is the first one between two aligned sweeps.
-        twist = poses.twist_to(self._T, self.stamp_ns, num_start + 1)
-        self._surface = None  # the surface in use is of later sweeps
-        for i in range(num_start - 1, -1, -1):
-            # ``twists[i + 1]`` is the velocity of the step from sweep i to the next sweep.
-            twist = twist if twists is None else twists[i + 1]
-            T_guess = self._T[i + 1] @ poses.exp(-twist * self._step_s[i])
-            end_ns = self.stamp_ns[i] + _SURFACE_NS
-            end = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
-            neighbours = range(i + 1, max(end, i + 2))  # the next sweep, at any distance in time
-            twist = self._align_sweep(i, i + 1, T_guess, twist, neighbours)
-
     def _align_sweep(
-        self, i: int, step_end: int, T_guess: Float, twist: Float, neighbours: range
+        self, i: int, adjacent: int, twist: Float, is_predicted: bool = False
     ) -> Float:
-        """Align sweep i with ``neighbours``, nearest first, and return its velocity (6,)."""
-        # The velocity is that of the step that ends at sweep ``step_end``, between sweep i and the
-        # adjacent sweep that has a pose already.
-        self._T[i] = T_guess  # without neighbours the sweep keeps its prediction
-        if neighbours:
-            surface, T_world_surface = self._surface_for(i, neighbours)
-            T_surface_lidar = poses.inverse(T_world_surface) @ T_guess
+        """Align sweep i with sweeps on the side of an adjacent one, and return its velocity (6,).
+
+        Args:
+            i: Index of the sweep.
+            adjacent: Index of the sweep before or after it, which has a pose already.
+            twist: (6,) velocity of the last step, the prediction if there is no other.
+            is_predicted: True keeps the prediction.
+        """
+        # The velocity is that of the step between both sweeps.
+        step_end = max(i, adjacent)
+        twist = twist if self._twists is None else self._twists[step_end]
+        seconds = (self.stamp_ns[i] - self.stamp_ns[adjacent]) * 1e-9
+        self._T[i] = self._T[adjacent] @ poses.exp(twist * seconds)
+        if not is_predicted:
+            self._surface = self._surface_for(i, adjacent)
+            surface, T_world_surface, _ = self._surface
+            T_surface_lidar = poses.inverse(T_world_surface) @ self._T[i]
             # Each round deskews the points by the velocity that the previous round found.
             for match_m in self._match_m:
                 points = deskew_points(self._sweeps[i], twist)
@@ -159,44 +222,32 @@ class _SweepSeries:
         self._points[i] = poses.transform(self._T[i], deskew_points(self._sweeps[i], twist))
         return twist
 
-    def _surface_for(self, i: int, neighbours: range) -> tuple[Surface, Float]:
-        """Return a surface to align sweep i with, and the (4,4) pose of this surface."""
-        if self._surface is not None:
-            surface, T_world_surface, latest = self._surface
-            if abs(self.stamp_ns[i] - self.stamp_ns[latest]) < FRESH_NS:
-                return surface, T_world_surface
-        T_world_surface = self._T[i].copy()
-        # The surface has the frame of sweep i's prediction.
-        chosen = neighbours[:: max(1, round(len(neighbours) / _MAX_SURFACE_SWEEPS))]
+    def _surface_for(self, i: int, adjacent: int) -> _PosedSurface:
+        """Return a surface to align sweep i with: the one in use, or one of the nearest second."""
+        since_ns = np.abs(self.stamp_ns - self.stamp_ns[i])
+        if self._surface is not None and since_ns[self._surface.latest] < FRESH_NS:
+            return self._surface
+        # The nearest sweep first, at any distance in time, and at most about 10 sweeps
+        side = range(i - 1, -1, -1) if adjacent < i else range(i + 1, len(self._sweeps))
+        neighbours = [j for j in side if j == adjacent or since_ns[j] <= _SURFACE_NS]
+        chosen = neighbours[:: max(1, round(len(neighbours) / 10))]
         points = np.concatenate([self._points[j] for j in chosen])
+        # The surface has the frame of sweep i's prediction.
+        T_world_surface = self._T[i].copy()
         points = poses.transform(poses.inverse(T_world_surface), points)
         surface = Surface.of(points, _VOXEL_M, self._num_neighbors)
-        self._surface = _PosedSurface(surface, T_world_surface, neighbours[0])
-        return surface, T_world_surface
+        return _PosedSurface(surface, T_world_surface, adjacent)
 
 
 def _align_once(surface: Surface, points: Float, T_surface_lidar: Float, match_m: float) -> Float:
     """Return the pose (4,4) after one alignment of points (N,3) with a surface, damped."""
-    source = thin(points, _VOXEL_M)
+    source = small_gicp.voxelgrid_sampling(points, _VOXEL_M)
     T_aligned, _, information = align(surface, source, T_surface_lidar, match_m)
     # A damped Gauss-Newton step towards the aligned pose: directions that few matches constrain
     # hardly move.
     gradient = information @ poses.log(poses.inverse(T_surface_lidar) @ T_aligned)
     motion = np.linalg.solve(information + _DAMPING, gradient)
     return np.asarray(T_surface_lidar @ poses.exp(np.asarray(motion, np.float64)))
-
-
-_MAX_STEP_M = 60.0  # sweeps farther apart hardly overlap
-_MAX_STEPS_AT_ONCE = 1000  # motions of the grid that are tried at once
-MAX_SPEED_M_S = 60.0  # a faster step between two sweeps is an error of registration
-# Change of a pose (rad and m) below which KISS-ICP stops. 3 mm in 0.1 s bend a sweep by 1.5 mm.
-_CONVERGED = 3e-3
-
-_STEP_M, _STEP_S = 0.5, 0.1  # steps of the speed search; smaller in proportion for shorter times
-_NUM_SAMPLES = 800
-_MAX_DISTANCE_M = 1.0  # greatest distance that counts
-_RAY_GAP_RAD = 0.01  # angle between rays; objects along the road meet the same rays at any speed
-_ABOVE_GROUND_M = 0.4
 
 
 def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
@@ -222,7 +273,8 @@ def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
     config.data.max_range, config.data.min_range = settings.max_range_m, settings.min_range_m
     config.data.deskew = False  # KISS-ICP aborts the process on equal times of points
     config.mapping.voxel_size = settings.voxel_size_m
-    config.registration.convergence_criterion = _CONVERGED
+    # Change of a pose (rad, m) at which KISS-ICP stops: 3 mm in 0.1 s bend a sweep by 1.5 mm.
+    config.registration.convergence_criterion = 3e-3
     # One thread: the order of a parallel sum, and with it the last bits, change between runs.
     config.registration.max_num_threads = 1
     odometry = KissICP(config)
@@ -257,19 +309,24 @@ def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
     pairs = []
     for i, (earlier, later) in enumerate(pairwise(map(above_ground, points[:3]))):
         _, rows = np.unique(np.floor(later), axis=0, return_index=True)  # even over 1 m voxels
-        sample = later[rows[:: len(rows) // _NUM_SAMPLES + 1]]
-        ray_gap_m = _RAY_GAP_RAD * np.linalg.norm(sample, axis=1)
+        sample = later[rows[:: len(rows) // 800 + 1]]
+        # Neighbouring rays are about 0.01 rad apart.
+        ray_gap_m = 0.01 * np.linalg.norm(sample, axis=1)
         pairs.append(_SweepPair(tree_of(earlier), sample, step_s[i] / step_s[0], ray_gap_m))
 
-    def find_best_step(steps_m: Float) -> Float:
-        chunks = np.array_split(steps_m, len(steps_m) // _MAX_STEPS_AT_ONCE + 1)
+    def find_best_step(centre_m: Float, reach_m: float, step_m: float) -> Float:
+        num_steps = np.ceil(reach_m / step_m)
+        span_m = np.arange(-num_steps, num_steps + 1) * step_m
+        x, y = np.meshgrid(centre_m[0] + span_m, centre_m[1] + span_m, indexing="ij")
+        steps_m = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
+        chunks = np.array_split(steps_m, len(steps_m) // 1000 + 1)  # limits the memory
         cost_m = np.concatenate([_step_cost_m(chunk, pairs) for chunk in chunks])
         return np.asarray(steps_m[np.argmin(cost_m)])
 
-    step_m = _STEP_M * min(1.0, step_s[0] / _STEP_S)
-    reach_m = min(MAX_SPEED_M_S * step_s[0], _MAX_STEP_M)
-    coarse_m = find_best_step(_grid(np.zeros(2), reach_m, 2 * step_m))
-    fine_m = find_best_step(_grid(coarse_m[:2], 2 * step_m, step_m))
+    step_m = 0.5 * min(1.0, step_s[0] / 0.1)
+    reach_m = min(MAX_SPEED_M_S * step_s[0], 60.0)  # sweeps farther apart hardly overlap
+    coarse_m = find_best_step(np.zeros(3), reach_m, 2 * step_m)
+    fine_m = find_best_step(coarse_m, 2 * step_m, step_m)
     return np.append(np.zeros(3), fine_m / step_s[0])
 
 
@@ -286,20 +343,14 @@ def _step_cost_m(steps_m: Float, pairs: Sequence[_SweepPair]) -> Float:
     """Return the (n,) sums of the pairs' mean distances for motions (n,3) of the second sweep."""
     # Distances below the gap between rays count as 0: a guard rail looks the same from a vehicle at
     # rest and from a vehicle that moves along the rail. Of equal motions the shortest is best.
+    # Distances above 1 m count as 1 m.
     cost_m = 1e-3 * np.linalg.norm(steps_m, axis=1)
     for pair in pairs:
         moved = (pair.sample + pair.duration_ratio * steps_m[:, None, :]).reshape(-1, 3)
-        distance_m, _ = pair.tree.query(moved, distance_upper_bound=_MAX_DISTANCE_M, workers=-1)
-        distance_m = np.minimum(distance_m, _MAX_DISTANCE_M).reshape(len(steps_m), -1)
+        distance_m, _ = pair.tree.query(moved, distance_upper_bound=1.0, workers=-1)
+        distance_m = np.minimum(distance_m, 1.0).reshape(len(steps_m), -1)
         cost_m += np.maximum(distance_m - pair.ray_gap_m, 0.0).mean(1)
     return np.asarray(cost_m)
-
-
-def _grid(centre: Float, reach_m: float, step_m: float) -> Float:
-    """Return (n,3) horizontal motions on a square grid around a centre (2,)."""
-    span = np.arange(-np.ceil(reach_m / step_m), np.ceil(reach_m / step_m) + 1) * step_m
-    x, y = np.meshgrid(centre[0] + span, centre[1] + span, indexing="ij")
-    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
 
 
 def above_ground(points: Float) -> Float:
@@ -309,13 +360,11 @@ def above_ground(points: Float) -> Float:
     """
     if not len(points):
         return points
-    x, y, z = points.T
-    row = np.floor(x).astype(np.int64)
-    row = row - row.min()
-    column = np.floor(y).astype(np.int64)
-    column = column - column.min()
-    cell = row * (column.max() + 1) + column
-    lowest = np.full(int(cell.max()) + 1, np.inf)
-    np.minimum.at(lowest, cell, z)
-    above = points.take(np.flatnonzero(z > lowest[cell] + _ABOVE_GROUND_M), axis=0)
+    x, y, z = np.ascontiguousarray(points.T)
+    cell = np.floor([x, y]).astype(np.int64)
+    cell -= cell.min(axis=1, keepdims=True)
+    number = np.ravel_multi_index(tuple(cell), tuple(cell.max(axis=1) + 1))
+    lowest = np.full(number.max() + 1, np.inf)
+    np.minimum.at(lowest, number, z)
+    above = points.take(np.flatnonzero(z > lowest[number] + 0.4), axis=0)
     return above if len(above) else points

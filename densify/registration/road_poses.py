@@ -20,7 +20,8 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
-from densify.registration.alignment import (
+from densify.registration.deskew import deskew_points
+from densify.registration.odometry import (
     FEW_POINTS,
     Alignment,
     Surface,
@@ -28,21 +29,10 @@ from densify.registration.alignment import (
     make_map,
     subsample,
 )
-from densify.registration.deskew import deskew_points
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
-_CHAIN_MATCH_M = 2.0  # greatest distance of a match in the chain
-_LONGEST_GAP_S = 0.4  # greatest time between two sweeps of the chain
-
-_LEAST_POINTS = 80_000  # points of a submap; rings of fewer points slide onto each other
-_MOST_SWEEPS = 5  # sweeps of a submap
 _PAIR_DISTANCES = (1, 4, 8)  # of the aligned pairs, in submaps
-_MATCH_M = 0.6  # greatest distance of a match between submaps
 _USUAL_M = 0.02  # usual error of a pair; a pair with a much larger error has less weight
-_NUM_STEPS = 10  # of Gauss-Newton
-# Limits of reliable alignments: overlap of neighbouring submaps, error of an alignment, share of
-# alignments with a greater error
-_LEAST_OVERLAP, _MOST_ERROR_M, _MOST_WRONG = 0.5, 0.1, 0.25
 
 
 def follow_road(
@@ -76,44 +66,35 @@ def follow_road(
     T_world_lidar, latest_ns = latest.T_world_lidar, latest.sweep.stamp_ns
     is_backwards = len(frames) > 0 and stamp_ns[0] < latest_ns
     twist = latest.twist_before if is_backwards else latest.twist_after
-    speed_m_s = float(np.linalg.norm(twist[3:]))
     travel_m = 0.0
     # The sweep nearest to the wanted gap is registered: a sweep is skipped if even the middle
     # between it and the next one lies within the gap, because the next one is then nearer.
     middle_ns = stamp_ns + np.diff(stamp_ns, append=stamp_ns[-1:]) / 2
     for frame, time_ns, to_next_ns in zip(frames, stamp_ns.tolist(), middle_ns, strict=True):
-        gap_s = min(_LONGEST_GAP_S, step_m / max(speed_m_s, 1e-3))
+        gap_s = min(0.4, step_m / max(float(np.linalg.norm(twist[3:])), 1e-3))
         is_near = abs(to_next_ns - latest_ns) < 1e9 * gap_s and frame != frames[-1]
         if travel_m >= reach_m or is_near:
             continue
-        sweep = _read_dense(frame, read)
-        if sweep is None:
+        try:
+            sweep = read(frame)
+        except InputError:
+            return
+        if len(sweep) < MIN_NUM_POINTS:
             return
         step_s = (time_ns - latest_ns) * 1e-9
         # Constant velocity predicts the pose, and deskews the sweep for the alignment.
         T_guess = T_world_lidar @ poses.exp(twist * step_s)
         guessed_surface = Surface.of(deskew_points(subsample(sweep, FEW_POINTS), twist))
-        T_aligned, overlap, _ = align(chain, guessed_surface, T_guess, _CHAIN_MATCH_M)
+        T_aligned, overlap, _ = align(chain, guessed_surface, T_guess, match_m=2.0)
         previous_twist = twist
         twist = poses.twist_between(T_world_lidar, T_aligned, step_s)
         if overlap < MIN_OVERLAP or find_jump(twist, previous_twist, abs(step_s)):
             return
         surface = Surface.of(deskew_points(subsample(sweep), twist))  # by the measured velocity
         chain.insert(surface.points, T_aligned)
-        T_world_lidar = T_aligned
-        latest_ns = time_ns
-        speed_m_s = float(np.linalg.norm(twist[3:]))
-        travel_m += speed_m_s * abs(step_s)
+        T_world_lidar, latest_ns = T_aligned, time_ns
+        travel_m += float(np.linalg.norm(twist[3:])) * abs(step_s)
         yield RegisteredSweep(sweep, T_world_lidar, twist, twist), surface
-
-
-def _read_dense(frame: int, read: Callable[[int], Sweep]) -> Sweep | None:
-    """Return the sweep of a frame, None if it cannot be read or is too sparse to be registered."""
-    try:
-        sweep = read(frame)
-    except InputError:
-        return None
-    return sweep if len(sweep) >= MIN_NUM_POINTS else None
 
 
 class Relaxed(NamedTuple):
@@ -125,8 +106,9 @@ class Relaxed(NamedTuple):
 
 
 def num_in_submap(num_points: float) -> int:
-    """Return the number of sweeps in a submap for sweeps with this number of points."""
-    return int(np.clip(np.ceil(_LEAST_POINTS / max(num_points, 1)), 1, _MOST_SWEEPS))
+    """Return the number of sweeps in a submap, 1 to 5, for sweeps with this number of points."""
+    # The rings of fewer than 80,000 points slide onto each other.
+    return int(np.clip(np.ceil(80_000 / max(num_points, 1)), 1, 5))
 
 
 def relax_poses(
@@ -162,15 +144,18 @@ def relax_poses(
         if len(sweeps) == 1:
             return surfaces[sweeps[0]]
         T_submap_lidar = poses.inverse(T[i]) @ T_world_lidar[sweeps]
-        return Surface.joined([surfaces[sweep] for sweep in sweeps], T_submap_lidar)
+        clouds = [
+            poses.transform(pose, surfaces[sweep].points.points()[:, :3])
+            for sweep, pose in zip(sweeps, T_submap_lidar, strict=True)
+        ]
+        return Surface.of(np.concatenate(clouds))
+
+    def align_pair(pair: tuple[int, int]) -> Alignment:
+        i, j = pair
+        return align(submaps[i], submaps[j], poses.inverse(T[i]) @ T[j], match_m=0.6)
 
     with ThreadPoolExecutor(num_threads()) as pool:
         submaps = dict(zip(needed_submaps, pool.map(make_submap, needed_submaps), strict=True))
-
-        def align_pair(pair: tuple[int, int]) -> Alignment:
-            i, j = pair
-            return align(submaps[i], submaps[j], poses.inverse(T[i]) @ T[j], _MATCH_M)
-
         alignments = list(pool.map(align_pair, pairs))
     graph = _Graph(np.array(pairs, int).reshape(-1, 2), is_fixed, alignments)
     T_relaxed = graph.relax(T)
@@ -185,24 +170,13 @@ def _group_into_submaps(is_known: Bool, num_sweeps: int) -> tuple[Int, Int]:
     """Return (n,) the ascending submap of each sweep, and (m,) the middle sweep of each submap."""
     # A submap has either known sweeps or others. Submaps are counted from the known sweeps, hence
     # incomplete ones lie at both ends of the road, and after the last known sweep.
-    begin = np.flatnonzero(is_known)[0]
-    end = np.flatnonzero(is_known)[-1] + 1
+    first, last = np.flatnonzero(is_known)[[0, -1]]
     row = np.arange(len(is_known))
-    num_known = end - begin
-    distance_before = begin - 1 - row[:begin]
-    distance_after = row[end:] - end
-    num_known_submaps = (num_known - 1) // num_sweeps + 1
-    submap = np.concatenate(
-        [
-            -1 - distance_before // num_sweeps,
-            row[:num_known] // num_sweeps,
-            num_known_submaps + distance_after // num_sweeps,
-        ]
-    )
+    after_known = (last - first) // num_sweeps + 1 + (row - last - 1) // num_sweeps
+    submap = np.where(row <= last, (row - first) // num_sweeps, after_known)
     submap_of_sweep = submap - submap[0]
-    middle = [
-        int(np.median(np.flatnonzero(submap_of_sweep == i))) for i in range(submap_of_sweep[-1] + 1)
-    ]
+    num_submaps = submap_of_sweep[-1] + 1
+    middle = [int(np.median(np.flatnonzero(submap_of_sweep == i))) for i in range(num_submaps)]
     return submap_of_sweep, np.array(middle)
 
 
@@ -223,30 +197,26 @@ class _Graph:
         """Return the submap poses (m,4,4) that fit the alignments best, by Gauss-Newton."""
         T = T_world_submap.copy()
         is_free = ~self._is_fixed
-        if not is_free.any():
-            return T
-        for _ in range(_NUM_STEPS):
-            T[is_free] = T[is_free] @ poses.exp(self._step(T))
+        if is_free.any():
+            for _ in range(10):
+                T[is_free] = T[is_free] @ poses.exp(self._step(T))
         return T
 
     def are_connected(self, T: Float) -> Bool:
         """Return (m,) True for submaps that reliable alignments at T (m,4,4) connect to fixed."""
         target, source = self._ends.T
-        is_wrong = self._error_m(self._residual(T)) > _MOST_ERROR_M
-        # Gap k lies between submaps k and k + 1. The last entry belongs to no gap.
-        num_wrong, num_spanning = np.zeros((2, len(self._is_fixed)))
-        for gap in range(len(self._is_fixed) - 1):
-            spans = (target <= gap) & (source > gap)
-            num_wrong[gap] = is_wrong[spans].sum()
-            num_spanning[gap] = spans.sum()
-        is_reliable = num_wrong <= _MOST_WRONG * num_spanning
+        is_wrong = self._error_m(self._residual(T)) > 0.1
+        # Gap k lies between submaps k and k + 1.
+        gap = np.arange(len(self._is_fixed) - 1)
+        spans = (target[:, None] <= gap) & (source[:, None] > gap)
+        is_reliable = (is_wrong[:, None] & spans).sum(axis=0) <= 0.25 * spans.sum(axis=0)
         is_adjacent = source - target == 1
-        is_reliable[target[is_adjacent]] &= self._overlap[is_adjacent] >= _LEAST_OVERLAP
+        is_reliable[target[is_adjacent]] &= self._overlap[is_adjacent] >= 0.5
         # A submap is connected if all gaps on its way to the fixed submaps are reliable.
         first, last = np.flatnonzero(self._is_fixed)[[0, -1]]
         connected = np.ones(len(self._is_fixed), bool)
         connected[:first] = np.logical_and.accumulate(is_reliable[:first][::-1])[::-1]
-        connected[last + 1 :] = np.logical_and.accumulate(is_reliable[last:-1])
+        connected[last + 1 :] = np.logical_and.accumulate(is_reliable[last:])
         return connected
 
     def _T_target_source(self, T: Float) -> Float:

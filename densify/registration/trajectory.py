@@ -15,11 +15,11 @@ from densify.config import RegisterSettings
 from densify.config.errors import InputError, SweepError, UnfitSweepError, UnplacedSweepError
 from densify.free_space.ground import find_upright
 from densify.geometry import poses
-from densify.geometry.nearest import tree_of
+from densify.geometry.nearest import is_near, tree_of
 from densify.geometry.types import Float, Int, Sweep, Trajectory
-from densify.registration.alignment import MANY_POINTS
 from densify.registration.odometry import (
     FRESH_NS,
+    MANY_POINTS,
     MAX_SPEED_M_S,
     above_ground,
     find_odometry,
@@ -32,11 +32,6 @@ MIN_OVERLAP = 0.55
 Correct poses gave 0.73 (16 beams, 25 m/s) to 0.98, false poses of a rosette 0.42.
 """
 MIN_NUM_POINTS = 1000  # a sweep with fewer cannot be registered
-_MAX_ACCELERATION_M_S2 = 30.0  # three times the grip of tyres, for noise of the stamps
-_POSE_NOISE_M = 0.5  # error of a pose that is not yet a jump
-_MAX_TURN_RATE_DEG_S = 150.0
-_OVERLAP_POINTS = 2000  # number of tested points of a sweep
-_OVERLAP_M = 0.5  # distance up to which points overlap
 
 
 class LeftOut(NamedTuple):
@@ -159,18 +154,19 @@ def find_jump(twist: Float, previous_twist: Float | None, step_s: float) -> str:
         previous_twist: (6,) velocity of the previous step, None if unknown.
         step_s: Duration of the step.
     """
-    # Errors of both poses appear as a speed, the greater the shorter the step.
-    slack_m_s = _POSE_NOISE_M / step_s
+    # Errors of both poses, 0.5 m, appear as a speed, the greater the shorter the step.
+    slack_m_s = 0.5 / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
-    if not (speed_m_s <= MAX_SPEED_M_S + slack_m_s and turn_deg_s <= _MAX_TURN_RATE_DEG_S):
+    if not (speed_m_s <= MAX_SPEED_M_S + slack_m_s and turn_deg_s <= 150.0):
         return (
             f"{speed_m_s:.0f} m/s and {turn_deg_s:.0f} deg/s, expected at most "
-            f"{MAX_SPEED_M_S:g} m/s and {_MAX_TURN_RATE_DEG_S:.0f} deg/s"
+            f"{MAX_SPEED_M_S:g} m/s and 150 deg/s"
         )
-    change_m_s = 0.0
-    if previous_twist is not None:
-        change_m_s = float(np.linalg.norm(twist[3:] - previous_twist[3:]))
-    if change_m_s > _MAX_ACCELERATION_M_S2 * step_s + slack_m_s:
+    if previous_twist is None:
+        return ""
+    change_m_s = float(np.linalg.norm(twist[3:] - previous_twist[3:]))
+    # Up to 30 m/s² pass, three times the grip of tyres, for noise of the stamps.
+    if change_m_s > 30.0 * step_s + slack_m_s:
         return (
             f"the speed changes by {change_m_s:.1f} m/s within {step_s:.2f} s, expected a vehicle's"
         )
@@ -197,7 +193,13 @@ def check_overlap(
         first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - FRESH_NS)), i - 1)
         share = _share_on(points_above[i], trees[first:i])
         if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < FRESH_NS:
-            share = max(share, _share_near_start(i, points_above, trees, stamp_ns))
+            # Few sweeps precede sweep i, hence those of the following third of a second count too.
+            # They must also hold the points of the sweep before i: otherwise all sweeps from i on
+            # could be of another place, and match each other.
+            end = int(np.searchsorted(stamp_ns, stamp_ns[i] + FRESH_NS))
+            share_on_others = _share_on(points_above[i], [*trees[:i], *trees[i + 1 : end]])
+            previous_share = _share_on(points_above[i - 1], trees[i:end])
+            share = max(share, min(share_on_others, previous_share))
         if share < MIN_OVERLAP:
             raise UnplacedSweepError(
                 f"registration fails from frame {frames[i - 1]} to {frames[i]}: only "
@@ -207,28 +209,14 @@ def check_overlap(
             )
 
 
-def _share_near_start(
-    i: int, points_above: Sequence[Float], trees: Sequence[cKDTree], stamp_ns: Int
-) -> float:
-    """Return the share of matched points at the step to sweep i, with the later sweeps' points."""
-    # Few sweeps precede sweep i, hence those of the following third of a second count too. They
-    # must also hold the points of the sweep before i: otherwise all sweeps from i on could be of
-    # another place, and match each other.
-    end = int(np.searchsorted(stamp_ns, stamp_ns[i] + FRESH_NS))
-    share = _share_on(points_above[i], [*trees[:i], *trees[i + 1 : end]])
-    previous_share = _share_on(points_above[i - 1], trees[i:end])
-    return min(share, previous_share)
-
-
 def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
     """Return the share of (N,3) points within 0.5 m of any tree's points; 1 for few points."""
-    if min(len(points), sum(tree.n for tree in trees)) < _OVERLAP_POINTS // 10:
+    if min(len(points), sum(tree.n for tree in trees)) < 200:
         return 1.0  # too few points for a decision
-    unmatched = points[:: len(points) // _OVERLAP_POINTS + 1]  # a sample, of which matches drop out
+    unmatched = points[:: len(points) // 2000 + 1]  # a sample, of which matches drop out
     num = len(unmatched)
     for tree in trees:
-        distance, _ = tree.query(unmatched, distance_upper_bound=_OVERLAP_M)
-        unmatched = unmatched[~np.isfinite(distance)]
+        unmatched = unmatched[~is_near(tree, unmatched, 0.5)]
     return 1 - len(unmatched) / num
 
 

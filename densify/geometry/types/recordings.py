@@ -125,15 +125,10 @@ class RegisteredSweep:
         Its twists are 0. A frame that the trajectory lacks raises ValueError.
         """
         index = trajectory.frames.index(frame)
-        sweep = Sweep(
-            frame=frame,
-            stamp_ns=int(trajectory.stamp_ns[index]),
-            points=np.zeros((0, 3)),
-            intensity=np.zeros(0, np.float32),
-            offset_ns=None,
-            lidar=np.zeros(0, np.uint8),
-            row=np.zeros(0, np.int64),
-        )
+        points, intensity = np.zeros((0, 3)), np.zeros(0, np.float32)
+        lidar, row = np.zeros(0, np.uint8), np.zeros(0, np.int64)
+        stamp_ns = int(trajectory.stamp_ns[index])
+        sweep = Sweep(frame, stamp_ns, points, intensity, None, lidar, row)
         return RegisteredSweep(sweep, trajectory.T_world_lidar[index], np.zeros(6), np.zeros(6))
 
 
@@ -210,7 +205,6 @@ class Motion(Protocol):
 
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of the points of sweep ``frame`` to the reference time of ``target``."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -318,7 +312,6 @@ class LidarSequence(Protocol):
     @property
     def frames(self) -> Sequence[int]:
         """Frame numbers of the existing sweeps, ascending."""
-        ...
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -332,22 +325,18 @@ class LidarSequence(Protocol):
 
     def stamp_ns(self, frame: int) -> int:
         """Return the reference time of a sweep in nanoseconds, without reading its points."""
-        ...
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
         """Return image number -> exposure time (ns) of a camera's middle row, both ascending."""
-        ...
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
         """Return the (H,W,3) RGB image with this number of the named camera."""
-        ...
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the data set's own (4,4) lidar pose at the sweep's reference time.
 
         The world is the data set's. InputError is raised if the data set has no poses.
         """
-        ...
 
 
 def in_one_line(sequence: LidarSequence) -> str:
@@ -413,7 +402,6 @@ class Truth(Protocol):
         Sweep ``target`` gives the target time. The flow is in the lidar frame of sweep ``frame``,
         ego-motion removed, and 0 for static points.
         """
-        ...
 
     def depth_m(self, camera: str, number: int) -> Float32:
         """Return the (H,W) true depth in metres of the image with this number of the named camera.
@@ -421,8 +409,6 @@ class Truth(Protocol):
         It is at the exposure of each row, in the camera's own measure (`Camera.measure`). It is 0
         where the ray meets no surface.
         """
-        ...
 
     def moving_mask(self, camera: str, number: int) -> Bool:
         """Return an (H,W) mask of the image ``number`` of a camera, True at moving objects."""
-        ...

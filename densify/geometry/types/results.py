@@ -125,13 +125,11 @@ class StaticWorld:
 
     def select(self, keep: Bool | Int) -> StaticWorld:
         """Return a world of the points that ``keep`` selects: a (K,) mask, or point indices."""
-        return select_rows(self, keep, _WORLD_COLUMNS)
+        columns = "points", "normal", "spacing_m", "source", "row", "lidar", "intensity"
+        return select_rows(self, keep, columns)
 
     def __len__(self) -> int:
         return len(self.points)
-
-
-_WORLD_COLUMNS = ("points", "normal", "spacing_m", "source", "row", "lidar", "intensity")
 
 
 class Reason(IntEnum):
