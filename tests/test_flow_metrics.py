@@ -10,7 +10,7 @@ import pytest
 
 from densify.readers.flow_files import CATEGORIES
 from densify.scores import flow_metrics as metrics
-from densify.scores.flow_metrics import CLASSES, IGNORED, challenge_scores
+from densify.scores.metrics import CLASSES, IGNORED, challenge_scores
 
 NAMES = ("NONE", *CATEGORIES)
 BUCKETED = {

@@ -11,7 +11,7 @@ import pytest
 
 from densify.free_space.range_image import RangeImage
 from densify.geometry.types import Cloud
-from densify.scores.cloud_scores import ghost_rate, ghost_scores
+from densify.scores.metrics import ghost_rate, ghost_scores
 from tests.depth_scenes import KEY, make_cloud, registered
 
 

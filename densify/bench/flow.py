@@ -37,15 +37,15 @@ from densify.pipeline.accumulate import accumulate
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
 from densify.readers.flow_files import LabelledFlow, read_labelled_flow
-from densify.scores.cloud_scores import ghost_rate
-from densify.scores.flow_metrics import (
+from densify.scores.metrics import (
     CLASSES,
     challenge_scores,
     end_point_error,
     end_point_errors,
+    ghost_rate,
     mean_of,
+    window_pose_errors,
 )
-from densify.scores.pose_metrics import window_pose_errors
 
 _MIN_RETURNS = 30
 _LEAST_MOTION_M = 0.5

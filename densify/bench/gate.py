@@ -49,8 +49,7 @@ from densify.pipeline.run import scene_of
 from densify.readers import open_sequence
 from densify.readers.timeline import choose_cameras
 from densify.registration.trajectory import Registration
-from densify.scores.flow_metrics import end_point_errors
-from densify.scores.pose_metrics import window_pose_errors
+from densify.scores.metrics import end_point_errors, window_pose_errors
 
 KINDS = ("depth", "flow", "registration")
 _WINDOW = 5

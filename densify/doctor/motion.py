@@ -44,7 +44,7 @@ from densify.registration.deskew import (
     sharpness,
     turning_s,
 )
-from densify.scores.pose_metrics import RecordedError, main_error
+from densify.scores.metrics import RecordedError, main_error
 
 _NEAR_M = 25.0  # range of the returns that show the ground, and that are compared for deskewing
 # Returns of the own vehicle

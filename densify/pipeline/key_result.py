@@ -31,7 +31,7 @@ from densify.pipeline.recording import FarSurfaces, Moment
 from densify.readers.prior_files import PriorFiles
 from densify.registration.deskew import find_compensated
 from densify.scores import depth_metrics
-from densify.scores.cloud_scores import ghost_scores
+from densify.scores.metrics import ghost_scores
 
 _log = logging.getLogger("densify")
 

@@ -38,7 +38,7 @@ from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, Motion, Stretch
 from densify.readers.column_files import read_arrow
 from densify.readers.decoded_files import read_arrays
-from densify.scores.flow_metrics import CLASSES, IGNORED
+from densify.scores.metrics import CLASSES, IGNORED
 
 MOVES_M = 0.05
 FARTHEST_M = 1000.0
@@ -173,7 +173,7 @@ class LabelledFlow:
     """The ground-truth flow of the N points of a registered sweep."""
 
     flow: Float  # (N,3) metres to the next sweep, ego-motion removed, in the sweep's lidar frame
-    # (N,) uint8 index in `densify.scores.flow_metrics.CLASSES`, or its ``IGNORED``
+    # (N,) uint8 index in `densify.scores.metrics.CLASSES`, or its ``IGNORED``
     classes: NDArray[np.uint8]
     valid: Bool  # (N,) bool, the ground-truth flow of the point is known
 

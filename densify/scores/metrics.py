@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: MIT
+"""Scores of poses, flow and clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from densify.free_space.range_image import RangeImage
+from densify.geometry import poses
+from densify.geometry.types import Bool, Cloud, Float, Stretch
+from densify.scores.depth_metrics import mean_or_none, shares_by_motion
+
+# Tolerance over half a second; an error of 1 % shifts surfaces by 0.1 m over 10 m.
+_OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
+
+
+def window_pose_errors(
+    stretch: Stretch, key: int, T_world_lidar: Callable[[int], Float]
+) -> tuple[float, float]:
+    """Return the root mean square errors (m, degrees) of a window's poses relative to the key's.
+
+    ``T_world_lidar`` returns the true (4,4) pose of a frame.
+    """
+    T_key_world = poses.inverse(T_world_lidar(key))
+    true = T_key_world @ np.stack([T_world_lidar(frame) for frame in stretch.frames])
+    estimated = np.stack([stretch.T_target_source(key, frame) for frame in stretch.frames])
+    T_error = poses.inverse(true) @ estimated
+    squared_m2 = T_error[:, :3, 3] ** 2
+    squared_rad2 = poses.log(T_error)[:, :3] ** 2
+    error_m, error_rad = (
+        np.sqrt(squared.sum(axis=1).mean()) for squared in (squared_m2, squared_rad2)
+    )
+    return float(error_m), float(np.rad2deg(error_rad))
+
+
+class RecordedError(NamedTuple):
+    """Error of recorded motions against odometry."""
+
+    m: float  # median translation error in metres
+    deg: float  # median rotation error in degrees
+    cost: float  # the larger error, as a multiple of its tolerance
+    way_m: float  # length of the longest motion by odometry
+
+    @staticmethod
+    def of(recorded: Sequence[Float], odometry: Sequence[Float]) -> RecordedError:
+        """Compare recorded motions (4,4), each over one stretch of sweeps, with odometry's."""
+        T_recorded, T_odometry = np.stack(recorded), np.stack(odometry)
+        difference = poses.log(poses.inverse(T_recorded) @ T_odometry)
+        way_m = np.linalg.norm(T_odometry[:, :3, 3], axis=1)
+        error_rad, error_m = (np.linalg.norm(half, axis=1) for half in np.hsplit(difference, 2))
+        error_deg = float(np.rad2deg(np.median(error_rad)))
+        cost_m = float(np.median(error_m / (_OFF_M + _OFF_PER_M * way_m)))
+        cost = max(cost_m, error_deg / _OFF_DEG)
+        return RecordedError(float(np.median(error_m)), error_deg, cost, float(way_m.max()))
+
+
+def main_error(
+    recorded: Sequence[Float], odometry: Sequence[Float], duration_s: float
+) -> tuple[str, str]:
+    """Return a clause about the main error of recorded motions (4,4), and one about its correction.
+
+    The error is a scale, or a drift over ``duration_s``. Without correction, that clause is "".
+    """
+    recorded_m, odometry_m = (
+        np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)
+    )
+    off_m, way_m = (recorded_m - odometry_m).mean(axis=0), odometry_m.mean(axis=0)
+    # Errors in different directions have no common cause.
+    if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(recorded_m - odometry_m, axis=1).mean():
+        mistake = "; no usual mistake explains it (another frame than the points', another clock,"
+        return f"{mistake} or noise)", ""
+    longer = float(off_m @ way_m / (way_m @ way_m))
+    if abs(longer) * np.linalg.norm(way_m) > 0.7 * np.linalg.norm(off_m):
+        sense = "long" if longer > 0 else "short"
+        mistake = f": their ways are {abs(longer) * 100:.1f} % too {sense}"
+        return mistake, f"divide their translations by {1 + longer:.3f}, or "
+    axis = int(np.argmax(np.abs(off_m)))
+    direction = (("forward", "back"), ("left", "right"), ("up", "down"))[axis][int(off_m[axis] < 0)]
+    return f": they go {abs(off_m[axis]) / duration_s:.2f} m/s {direction} beside the sweeps", ""
+
+
+STRICT, RELAXED = 0.05, 0.1
+"""Limits of `accuracy`, both in metres and as a share of the true flow's length."""
+CLASSES = ("BACKGROUND", "CAR", "OTHER_VEHICLES", "PEDESTRIAN", "WHEELED_VRU", "OBJECT")
+"""The challenge's classes; a point's class is the index. OBJECT is an object of unknown kind."""
+IGNORED = 255
+"""Class number of points that the challenge leaves out, such as signs."""
+_WITHIN_M = 35.0  # the challenge's range, on each side of the vehicle
+_MOVES_M = 0.05  # flow of a moving point, per sweep
+_EDGES_M = np.linspace(0, 2.0, 51)  # lower edges of the buckets; the first holds static points
+
+
+def end_point_errors(estimated: Float, true: Float) -> Float:
+    """Return the (N,) end-point errors in metres, |estimated - true| of (N,3) flows."""
+    return np.linalg.norm(np.asarray(estimated, np.float64) - np.asarray(true, np.float64), axis=1)
+
+
+def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> float:
+    """Return the mean end-point error in metres of (N,3) flows, over ``mask`` (N,) if given."""
+    error_m = end_point_errors(estimated, true)
+    return mean_of(error_m if mask is None else error_m[mask])
+
+
+def accuracy(estimated: Float, true: Float, limit: float) -> float:
+    """Return the share of points with an end-point error below a limit.
+
+    The limit is ``limit`` metres or, if larger, ``limit`` times the length of the true flow.
+    """
+    error_m = end_point_errors(estimated, true)
+    return mean_of((error_m < limit) | (error_m < limit * np.linalg.norm(true, axis=1)))
+
+
+def angle_error_rad(estimated: Float, true: Float) -> float:
+    """Return the mean angle from true to estimated flow, where true flow is not 0.
+
+    An estimate of 0 counts as a right angle.
+    """
+    length_m = np.linalg.norm(true, axis=1)
+    flow, truth, length_m = (values[length_m > 0] for values in (estimated, true, length_m))
+    lengths = np.linalg.norm(flow, axis=1) * length_m
+    dot = np.einsum("nd,nd->n", flow, truth)
+    cosine = np.divide(dot, lengths, out=np.zeros(len(flow)), where=lengths > 0)
+    return mean_of(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def mean_of(values: Float | Bool) -> float:
+    """Return the mean of the values, NaN if there are none."""
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def challenge_scores(
+    points: Float, estimated: Float, true: Float, classes: NDArray[Any]
+) -> dict[str, Any]:
+    """Score flow as the Argoverse 2 scene flow challenges do, within 35 m of the vehicle.
+
+    Args:
+        points: (N,3) metres, vehicle frame, without ground.
+        estimated: (N,3) estimated flow in metres.
+        true: (N,3) true flow.
+        classes: (N,) indices in `CLASSES`, or `IGNORED`.
+
+    Returns:
+        ``three_way``: mean errors in metres of moving objects (0.05 m a sweep or more), of other
+            objects, of the static background, and the mean of the three (Chodosh, Ramanan, Lucey,
+            WACV 2024; the package av2). ``bucketed``: for each class with points and MEAN,
+            ``static_m``, the mean error in the first bucket of true flow, and ``dynamic``, the mean
+            over the others of error divided by true length (Khatri et al., "I Can't Believe It's
+            Not Scene Flow!", ECCV 2024; the package bucketed-scene-flow-eval). ``num_points``:
+            number of scored points.
+    """
+    scored = np.abs(points[:, :2]).max(axis=1, initial=0) < _WITHIN_M
+    scored &= classes < len(CLASSES)
+    error_m = end_point_errors(estimated, true)[scored]
+    length_m = np.linalg.norm(np.asarray(true, np.float64), axis=1)[scored]
+    class_number = classes[scored].astype(np.intp)
+    moves, is_object = length_m >= _MOVES_M, class_number > 0
+    three_way = {
+        "foreground_dynamic_m": mean_of(error_m[is_object & moves]),
+        "foreground_static_m": mean_of(error_m[is_object & ~moves]),
+        "background_static_m": mean_of(error_m[~is_object & ~moves]),
+    }
+    three_way["mean_m"] = sum(three_way.values()) / len(three_way)
+    bucket = np.digitize(length_m, _EDGES_M) - 1
+    bucketed = {
+        CLASSES[number]: _bucketed(
+            *(column[class_number == number] for column in (error_m, length_m, bucket))
+        )
+        for number in np.unique(class_number)
+    }
+    means = {}
+    for name in ("static_m", "dynamic"):
+        column = np.array([row[name] for row in bucketed.values()], np.float64)
+        means[name] = mean_of(column[np.isfinite(column)])
+    return {
+        "three_way": three_way,
+        "bucketed": {**bucketed, "MEAN": means},
+        "num_points": int(scored.sum()),
+    }
+
+
+def _bucketed(error_m: Float, length_m: Float, bucket: NDArray[np.intp]) -> dict[str, float]:
+    """Return the two scores of one class with points."""
+    # Sums over the points of each bucket but the first
+    errors, lengths = (
+        np.bincount(bucket, values, len(_EDGES_M))[1:] for values in (error_m, length_m)
+    )
+    filled = lengths > 0
+    quotients = errors[filled] / lengths[filled]
+    return {"static_m": mean_of(error_m[bucket == 0]), "dynamic": mean_of(quotients)}
+
+
+_GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
+
+
+def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
+    """Return (M,) True for ghosts, and (M,) True for points that the key sweep cannot judge.
+
+    At a ghost's position, all returns of the key sweep in its cell and the eight around it, at
+    least six, are farther by more than max(0.5 m, 2 % of its range). Dark paint and glass hide
+    ghosts. Points of the key sweep and of sweeps beyond the window are False in both masks.
+    """
+    ghost, unjudged = np.zeros((2, len(cloud)), bool)
+    rows = np.flatnonzero(_others(cloud, key))
+    margins_m = (_GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION)
+    beyond = key_image.count_beyond(
+        cloud.points[rows], margins_m, _MIN_FILLED, cloud.velocity_m_s[rows]
+    )
+    ghost[rows] = (beyond >= _MIN_FILLED).any(axis=0)
+    unjudged[rows] = (beyond == 0).all(axis=0)
+    return ghost, unjudged
+
+
+def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
+    """Return the share of `ghosts` among the window's points of other sweeps, None without any."""
+    return mean_or_none(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
+
+
+def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
+    """Return the shares of `ghosts` among the ``num_points`` points of the window's other sweeps.
+
+    They are for ``all``, ``moving`` and ``static`` points, by frames (``by_distance["3"]``) and
+    seconds (``by_seconds["0.30"]``) from the key sweep. ``unjudged`` has the shares that it cannot
+    judge.
+    """
+    rows = np.flatnonzero(_others(cloud, key))
+    ghost, unjudged = (mask[rows] for mask in ghosts(cloud, key_image, key))
+    moving = cloud.moving[rows]
+    distance = np.abs(cloud.frame[rows] - key)
+    hundredths = np.rint(np.abs(cloud.since_key_ns[rows]) / 1e7).astype(np.int64)
+    return {
+        "num_points": len(rows),
+        **shares_by_motion(ghost, moving),
+        "unjudged": shares_by_motion(unjudged, moving),
+        "by_distance": {str(steps): rate for steps, rate in _rates(ghost, distance).items()},
+        "by_seconds": {f"{h / 100:.2f}": rate for h, rate in _rates(ghost, hundredths).items()},
+    }
+
+
+def _others(cloud: Cloud, key: int) -> Bool:
+    """Return (M,) True for points of the window that are not from the key sweep."""
+    return (cloud.frame != key) & ~cloud.far
+
+
+def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
+    """Return the share of ghosts in each group number (N,) that has points, ascending."""
+    num, num_ghosts = np.bincount(group), np.bincount(group, ghost)
+    return {g: float(num_ghosts[g] / num[g]) for g in np.flatnonzero(num).tolist()}
