@@ -58,7 +58,7 @@ def test_what_the_network_rightly_sees_move_moves(driving: Scene, model, monkeyp
     def roughly(i: int, points: np.ndarray) -> np.ndarray:
         field = exact.flow(frames[i], frames[i + 1 if i + 1 < len(frames) else i - 1])
         R_world_lidar = driving.stretch.sweeps[i].T_world_lidar[:3, :3]
-        flow = 0.8 * field.displacement[driving.candidates[i].row] @ R_world_lidar.T
+        flow = 0.8 * field.displacement[driving.obstacles[i].row] @ R_world_lidar.T
         flow[::2] = 0
         return flow
 

@@ -128,8 +128,7 @@ def test_the_weights_separate_the_tracks_of_a_street_that_had_no_part_in_the_fit
     scene = Scene(World((*street(), *leaves, *movers, walker)), EGO, scanner)
     stretch = scene.stretch(KEY, 5)
     space, heights = FreeSpace.of(stretch), ground(stretch)
-    found = find_candidates(stretch, space, heights)
-    obstacles = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]
+    obstacles = find_candidates(stretch, space, heights)
     shares, log_odds = [], []
 
     def record(track, evidence):
@@ -160,8 +159,7 @@ class Seen:
         self.scene = Scene(World((*street(), *boxes)), EGO, Scanner(sigma_m=0.01))
         stretch = self.scene.stretch(KEY, 5)
         self.space = FreeSpace.of(stretch)
-        found = find_candidates(stretch, self.space, ground(stretch))
-        self.obstacles = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]
+        self.obstacles = find_candidates(stretch, self.space, ground(stretch))
 
     def track(self, boxes: list[int], begin_m: float) -> Track:
         """The returns of these boxes in a frame of 4.4 m that moves along; begin_m: where it begins

@@ -10,7 +10,7 @@ from typing import Protocol, cast
 
 from densify.config import Config
 from densify.config.plugins import engine
-from densify.flow.tracking.candidates import Candidates, find_candidates
+from densify.flow.tracking.candidates import Obstacles, find_candidates
 from densify.free_space.ground import HeightMap
 from densify.free_space.range_image import FreeSpace
 from densify.geometry.types import Motion, Stretch
@@ -31,7 +31,7 @@ class Scene:
         return FreeSpace.of(self.stretch)
 
     @cached_property
-    def candidates(self) -> tuple[Candidates, ...]:
+    def obstacles(self) -> tuple[Obstacles, ...]:
         """The points of each sweep above the ground, and which of them may move."""
         return find_candidates(self.stretch, self.space, self.ground)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from densify.config import Config
 from densify.flow.engines import Scene
-from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times_s
+from densify.flow.tracking.candidates import Obstacles, firing_times_s
 from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_tracked_at
 from densify.flow.tracking.objects import MovingObject, Shape, Track, near_m
 from densify.flow.tracking.soften import Snapshot, Softened, soften
@@ -111,26 +111,23 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 
     Below 10 Hz, objects that turn, bend or are occluded between sweeps are tracked worse or lost.
     """
-    return find_group_motion(scene, scene.candidates)
+    return find_group_motion(scene, scene.obstacles)
 
 
 def find_group_motion(
     scene: Scene,
-    candidates: Sequence[Candidates],
+    obstacles: Sequence[Obstacles],
     velocities_m_s: Sequence[Float] | None = None,
 ) -> GroupMotion:
     """Return the motion of the objects found among the points of each sweep that may move.
 
     Args:
         scene: Registered sweeps. Points of batches without a sweep that is asked for stay static.
-        candidates: For each sweep, its C points above the ground, and which may move.
+        obstacles: For each sweep, its C points above the ground, and which may move.
         velocities_m_s: For each sweep, (C,3) approximate velocities of these points, world frame.
             None estimates them by a vote of neighbouring sweeps.
     """
     stretch, space = scene.stretch, scene.space
-    obstacles = [
-        Obstacles.of(stretch, i, sweep_candidates) for i, sweep_candidates in enumerate(candidates)
-    ]
     tracks = find_tracks(obstacles, space, scene.ground, velocities_m_s)
     objects = [MovingObject(track, find_shape(track, obstacles, space)) for track in tracks]
 
