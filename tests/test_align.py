@@ -57,7 +57,7 @@ def slow_align(model: Model, points, predicted) -> np.ndarray | None:
     return state
 
 
-@pytest.mark.parametrize("num_points", [6, 40, 600])
+@pytest.mark.parametrize("num_points", [MIN_FIT - 1, MIN_FIT, 40, 600])
 @pytest.mark.parametrize("num_in_model", [8, 900, 2500])
 @pytest.mark.parametrize("flat", [False, True])
 def test_the_alignment_is_its_slow_twin(flat: bool, num_in_model: int, num_points: int) -> None:
@@ -71,19 +71,10 @@ def test_the_alignment_is_its_slow_twin(flat: bool, num_in_model: int, num_point
         model.align(points, CENTRE, predicted, STD),
         slow_align(model, points, predicted),
     )
-    assert (found is None) == (expected is None)
+    assert (found is None) == (expected is None) and (num_points >= MIN_FIT or found is None)
     if found is not None:
         np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
-def test_a_known_motion_is_found_and_the_height_is_kept() -> None:
-    true = np.array([1.4, -0.6, 0.25, 0.3])
-    predicted = true + [0.15, -0.1, 0.0, 0.03]
-    points = apply(true, corner(500, 1), CENTRE)
-    found = Model(corner(900, 2)).align(points, CENTRE, predicted, STD)
-    np.testing.assert_allclose(found, true, atol=0.02)
-    assert found[2] == predicted[2]
-    np.testing.assert_array_equal(predicted, true + [0.15, -0.1, 0.0, 0.03])  # not changed
+        assert found[2] == predicted[2]
 
 
 def test_the_prediction_holds_what_the_points_leave_open() -> None:
@@ -94,10 +85,3 @@ def test_the_prediction_holds_what_the_points_leave_open() -> None:
     predicted = np.array([0.3, 0.2, 0.0, 0.0])
     found = Model(wall).align(seen, CENTRE, predicted, np.array([0.01, 0.3, 0.06]))
     assert abs(found[0] - 0.3) < 0.02 and abs(found[1]) < 0.02
-
-
-def test_too_few_partners_are_none() -> None:
-    model, still = Model(corner(300, 0)), np.zeros(4)
-    assert model.align(corner(300, 1) + [50.0, 0, 0], CENTRE, still, STD) is None
-    assert model.align(corner(MIN_FIT - 1, 1), CENTRE, still, STD) is None
-    assert model.align(corner(MIN_FIT, 1), CENTRE, still, STD) is not None

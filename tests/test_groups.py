@@ -67,22 +67,57 @@ def test_movers_are_found_and_moved_right(traffic, instance):
     assert np.quantile(errors, 0.9) < 0.08
 
 
-def test_only_what_moves_is_displaced(traffic):
-    for flow in traffic.fields:
-        for vectors in (flow.displacement, flow.to_reference, flow.velocity_m_s):
+def test_only_what_moves_is_displaced_and_nothing_to_its_own_sweep(traffic):
+    for frame, flow in zip(traffic.stretch.frames, traffic.fields, strict=True):
+        own = traffic.motion.flow(frame, frame)
+        assert np.abs(own.displacement).max() < 1e-12
+        assert np.array_equal(own.moving, flow.moving) and own.moving.any()
+        assert np.linalg.norm(own.velocity_m_s[own.moving], axis=1).min() > 0.5
+        for vectors in (flow.displacement, flow.to_reference, flow.velocity_m_s, own.displacement):
             assert not vectors[~flow.moving].any()
         assert np.array_equal(flow.moving, flow.instance >= 0)
         assert not flow.lost.any()
 
 
-def test_the_flow_of_a_sweep_to_itself_is_zero_with_its_movers_marked(traffic):
-    for frame in traffic.stretch.frames:
-        flow = traffic.motion.flow(frame, frame)
-        assert np.abs(flow.displacement).max() < 1e-12
-        assert not flow.displacement[~flow.moving].any()
-        on = traffic.scene.scan(frame).instance >= 0
-        assert flow.moving[on].mean() > 0.6
-        assert np.linalg.norm(flow.velocity_m_s[on & flow.moving], axis=1).min() > 0.5
+SIXTY_FOUR = Scanner(64, 1800, (-24.8, 2.0), 0.01)
+TRUCK_M = (16.0, 2.5, 2.8)
+PASSING_S = 7 * SWEEP_S  # until the middle sweep of the passing truck
+TURNING = car(26, 1.5, 5, 1, yaw=np.pi * 0.75, turn_rad_s=0.4, size_m=(9.0, 2.4, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("box", "speed_m_s", "scanner", "middle", "size", "expected"),
+    [
+        # its ends go different ways
+        (TURNING, 3.0, NOISE, KEY, 4, (3, 0.6, 0.5, 0.05)),
+        # a flat back that is followed for long: only its ends tell where it is, and errors add up
+        (car(10, -1.5, 6, 1), 4.0, FLAT_BACK, 8, 6, (3, 0.95, 0.9, 0.03)),
+        # most of a long side that passes does not tell how fast: from farther away its front does
+        (
+            car(24 * PASSING_S, 3, 24, 1, yaw=np.pi, size_m=TRUCK_M),
+            0.0,
+            Scanner(32, 540, (-24.8, 2.0), 0.01),
+            7,
+            6,
+            (6, 0.95, 0.9, 0.3),
+        ),
+        # a truck 25 m ahead in the next lane, on which columns of rays lie more than a metre apart
+        (car(33, 2.2, 13, 1, size_m=TRUCK_M), 12.0, SIXTY_FOUR, KEY, 5, (3, 0.97, 0.95, 0.1)),
+        # a bus beside the scanner: only its ends are ever seen through
+        (car(4, 2.6, 3, 1, size_m=(18.0, 2.5, 3.0)), 6.0, NOISE, KEY, 4, (4, 0.99, 0.99, 0.08)),
+    ],
+    ids=["turning truck", "flat back", "passing truck", "wide columns", "bus"],
+)
+def test_a_surface_that_hardly_shows_its_motion_is_one_object_and_does_not_slide(
+    box, speed_m_s, scanner, middle, size, expected
+):
+    """expected: sweeps around the key, share that moves, quantile of the errors and its bound."""
+    reach, least_moving, quantile, error_m = expected
+    scene = Scene(World((*street(), box)), Arc(0, -1.5, 0, speed_m_s), scanner)
+    found = Found.around(middle, scene, size)
+    assert found.share_moving(1, reach) > least_moving
+    assert np.quantile(found.errors_m(1, reach), quantile) < error_m
+    assert found.false_share() < 2e-4
 
 
 def test_same_bytes_every_time(traffic):
@@ -92,17 +127,6 @@ def test_same_bytes_every_time(traffic):
         assert a.total.tobytes() == b.total.tobytes()
         assert a.velocity_m_s.tobytes() == b.velocity_m_s.tobytes()
         assert a.instance.tobytes() == b.instance.tobytes()
-
-
-def test_a_turning_truck():
-    box = car(26, 1.5, 5, 1, yaw=np.pi * 0.75, turn_rad_s=0.4, size_m=(9.0, 2.4, 3.0))
-    truck = Found.of([box], Arc(0, -1.5, 0, 3.0))
-    assert truck.share_moving(1) > 0.6
-    assert np.median(truck.errors_m(1)) < 0.05
-    assert truck.false_share() < 2e-4
-    # its ends go different ways: a translation for all would be wrong
-    true = truck.scene.displacement(KEY + 1, KEY)[truck.scene.scan(KEY + 1).instance == 1]
-    assert np.ptp(true, axis=0).max() > 0.1
 
 
 def test_the_trailer_of_a_turning_truck_is_found():
@@ -127,16 +151,6 @@ def test_the_trailer_of_a_turning_truck_is_found():
     assert found.false_share() < 1e-3
 
 
-def test_a_flat_back_that_is_followed_for_long_does_not_slide_aside():
-    """Nothing but its two ends tells where it is, and 13 sweeps add up what each is off."""
-    scene = Scene(World((*street(60.0), car(10, -1.5, 6, 1))), Arc(0, -1.5, 0, 4.0), FLAT_BACK)
-    found = Found.around(8, scene, 6)
-    assert found.share_moving(1) > 0.95
-    assert np.quantile(found.errors_m(1), 0.9) < 0.03
-    aside = [f.velocity_m_s[(s.instance == 1) & f.moving, 1] for _, s, f in found.near_key()]
-    assert np.abs(np.concatenate(aside)).max() < 0.25
-
-
 def test_a_flat_front_that_turns_does_not_slide_aside():
     """It goes where its heading does, and the front alone hardly tells where that is."""
     middle, turn_rad_s = 8, 0.4
@@ -150,36 +164,12 @@ def test_a_flat_front_that_turns_does_not_slide_aside():
     assert np.quantile(found.errors_m(1, reach=6), 0.9) < 0.1
 
 
-def test_a_long_side_that_passes_does_not_slide_along_itself():
-    """Where most is seen of it nothing tells how fast it is: from farther away its front does."""
-    middle = 7
-    truck = car(24 * middle * SWEEP_S, 3, 24, 1, yaw=np.pi, size_m=(16.0, 2.5, 2.8))
-    scanner = Scanner(32, 540, (-24.8, 2.0), 0.01)
-    found = Found.around(middle, Scene(World((*street(), truck)), Arc(0, -1.5), scanner), 6)
-    assert found.share_moving(1, reach=6) > 0.95
-    assert np.quantile(found.errors_m(1, reach=6), 0.9) < 0.3
-
-
-def test_a_long_side_that_is_seen_in_far_apart_columns_is_one_object():
-    """Of a truck 25 m ahead in the next lane columns of rays lie more than a metre apart."""
-    truck = car(33, 2.2, 13, 1, size_m=(16.0, 2.5, 2.8))
-    scanner = Scanner(64, 1800, (-24.8, 2.0), 0.01)
-    found = Found.around(KEY, Scene(World((*street(), truck)), Arc(0, -1.5, 0, 12.0), scanner), 5)
-    assert found.share_moving(1) > 0.97
-    assert np.quantile(found.errors_m(1), 0.95) < 0.1
-
-
 def test_cars_in_a_row_keep_their_own_motion():
     found = Found.of([car(8, 2.0, 11, 1), car(23, 2.0, 8, 2)], Arc(0, -1.5, 0, 8.0))
     assert found.track_of(1) != found.track_of(2)
-    for instance, speed_m_s in ((1, 11), (2, 8)):
+    for instance in (1, 2):
         assert found.share_moving(instance) > 0.7
         assert np.quantile(found.errors_m(instance), 0.9) < 0.08
-        for frame, scan, flow in found.near_key():
-            on = (scan.instance == instance) & flow.moving
-            if frame != KEY:
-                length = np.linalg.norm(flow.displacement[on], axis=1)
-                assert np.median(length) == pytest.approx(0.1 * speed_m_s, abs=0.08)
 
 
 def test_a_car_that_passes_behind_a_pillar():
@@ -215,10 +205,7 @@ def test_a_stretch_of_one_sweep_has_no_flow():
     assert not found.fields[0].displacement.any() and not found.fields[0].moving.any()
 
 
-ANY_PAIRS = [(1, 9), (8, 1), (3, 4)]
-
-
-@pytest.mark.parametrize(("frame", "target"), ANY_PAIRS)
+@pytest.mark.parametrize(("frame", "target"), [(1, 9), (8, 1), (3, 4)])
 def test_over_several_sweeps_it_stays_right(traffic, frame, target):
     """Truth goes from each point's firing over the time between the sweeps."""
     flow = traffic.motion.flow(frame, target)

@@ -58,7 +58,8 @@ def numbers(part_of: Callable[[np.ndarray], np.ndarray], *speeds_m_s: float) -> 
         coefficients = path.coefficients + (at_s - mid_s)[:, None] * off
         wrong.path = type(path)(coefficients, path.begin_s, path.end_s, path.residual_m)
         tracks.append(wrong)
-    return join_pieces(scene.stretch, tracks, pieces, space).object_of_track
+    object_of_track, _ = join_pieces(scene.stretch, tracks, pieces, space)
+    return object_of_track
 
 
 def halves(x: np.ndarray) -> np.ndarray:

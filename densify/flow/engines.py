@@ -70,13 +70,8 @@ class EngineModule(Protocol):
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
     """Return the motion of all points in a scene, by one scene flow engine.
 
-    Args:
-        scene: Registered sweeps, their ground and free space.
-        settings: Configuration of the run.
-        spec: Engine as ``NAME`` or ``NAME:ARGUMENT``, such as ``groups``; None for ``flow.engine``.
-
-    Raises:
-        InputError: No engine has this name, or the engine rejects its argument.
+    It is the engine ``spec``, as ``NAME`` or ``NAME:ARGUMENT``, or that of the settings. InputError
+    is raised for an unknown name, or an argument that the engine rejects.
     """
     plugin, argument = engine(spec or settings.flow.engine)
     module = cast(EngineModule, plugin.load_module())

@@ -13,7 +13,7 @@ from densify.flow.engines import Scene
 from densify.flow.tracking.candidates import Obstacles, cluster_rings
 from densify.flow.tracking.groups import GroupMotion, find_group_motion
 from densify.geometry.types import Float
-from densify.learning.network import NUM_SWEEPS, AboveGround, Model, order_for, read_model
+from densify.learning.network import AboveGround, Model, order_for, read_model
 
 # Least speed by the network of points that may start a track (Chodosh et al., WACV 2024)
 MOVES_M_S = 0.5
@@ -56,7 +56,7 @@ def flows_of(model: Model, above: list[AboveGround], origins: list[Float]) -> li
         if len(above) < 2 or not len(source.row):
             flows.append(np.zeros((len(source.row), 3)))
             continue
-        numbers = order_for(index, _neighbor(index, len(above)), len(above), NUM_SWEEPS)
+        numbers = order_for(index, _neighbor(index, len(above)), len(above))
         clouds = [
             None if number is None else above[number].cloud(origins[index]) for number in numbers
         ]

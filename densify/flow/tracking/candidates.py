@@ -141,9 +141,7 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
     return Obstacles(row, points, time_s, seed, label, int(num_clusters))
 
 
-def find_candidates(
-    stretch: Stretch, space: FreeSpace, ground: HeightMap
-) -> tuple[Obstacles, ...]:
+def find_candidates(stretch: Stretch, space: FreeSpace, ground: HeightMap) -> tuple[Obstacles, ...]:
     """Return, for each sweep in order, its points above the ground, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,

@@ -38,14 +38,12 @@ class DistanceField:
 
     nearness: Bytes  # (X,Y,Z) voxels of 0.2 m: 255 at a candidate, falling to 0 at 0.6 m from it
     low: Float  # (3,) corner of the grid, world
-    tree: cKDTree | None  # search tree of the N candidates; None without candidates
+    tree: cKDTree  # search tree of the N candidates
     time_s: Float  # (N,) firing times of the candidates
 
     @staticmethod
     def of(points: Float, time_s: Float) -> DistanceField:
-        """Build the field of N candidates from points (N,3, world) and firing times (N,)."""
-        if not len(points):
-            return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
+        """Build the field of N > 0 candidates from points (N,3, world) and firing times (N,)."""
         # The margin of the grid is wider than the reach of a candidate.
         inside = points[bulk(points, STEP_M, _MOST_VOXELS)]
         low = inside.min(0) - 2 * LINK_M
@@ -67,8 +65,6 @@ class DistanceField:
         Nearness is from 0 (no candidate within 0.6 m) to 255. The points are moved at velocities
         (V,3), m/s, world, to the time when this sweep fired at the new position.
         """
-        if self.tree is None:
-            return
         # The firing time depends on the position, and the position on the time. Each is taken from
         # the nearest candidate, first at the group's old position, then at the moved position.
         _, old_neighbour = nearest(self.tree, group.middle[None])
@@ -288,9 +284,7 @@ class Follower:
 
         # Phase 1: free obstacles in the box around the expected position. The firing time of the
         # points is not known yet, hence the box grows by the motion within the batch.
-        expected, expected_rate, _ = _predict(
-            track, rate, num_recent, track.seen_at(batch.time_ns)
-        )
+        expected, expected_rate, _ = _predict(track, rate, num_recent, track.seen_at(batch.time_ns))
         expected_points = apply(expected, model.points, centre)
         slack_m = GATES_M[0] + batch.half_s * np.abs(expected_rate[:3])
         low, high = expected_points.min(0) - slack_m, expected_points.max(0) + slack_m

@@ -20,7 +20,7 @@ from densify.flow.tracking.candidates import LINK_M, Obstacles
 from densify.flow.tracking.objects import MovingObject, Track, near_m
 from densify.free_space.range_image import REACH_S, FreeSpace
 from densify.geometry.nearest import is_near, nearest, tree_of
-from densify.geometry.types import Bool, Float
+from densify.geometry.types import Float
 
 NUM_ASKED = 60  # greatest number of tested points of a batch
 _PRIOR_COUNT = 5.0  # added to both counts of a ratio, because few observations are weak evidence
@@ -35,12 +35,6 @@ class Places(NamedTuple):
 
     num_occupied: int  # number of positions with a return of something else
     num_free: int  # number of positions in observed free space
-
-    def add(self, is_occupied: Bool, is_free: Bool) -> Places:
-        """Return the counts with those of more positions (P,), occupied or free by two masks."""
-        return Places(
-            self.num_occupied + int(is_occupied.sum()), self.num_free + int(is_free.sum())
-        )
 
     def log_occupied(self) -> float:
         """Return the log odds that a position is occupied, near 0 for few observations."""
@@ -238,7 +232,7 @@ def count_vacated_places(
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     # Positions that the object left longer than `REACH_S` ago do not count.
     reach_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
-    before = after = Places(0, 0)
+    counts = np.zeros((2, 2), int)  # before and after, occupied and free
     for batch in space.batches:
         first, last = batch[0], batch[-1]
         in_object = track.undo(positions, space.clock.time_s[first])
@@ -254,9 +248,10 @@ def count_vacated_places(
         returns = [_returns_near(vacated, within_m, obstacles[j], objects) for j in batch]
         is_occupied = is_near(tree_of(np.concatenate(returns)), vacated, within_m)
         is_free = space.seen_through(vacated, first) & ~is_occupied
-        before = before.add(is_occupied[~is_after], is_free[~is_after])
-        after = after.add(is_occupied[is_after], is_free[is_after])
-    return before, after
+        for row, at_row in enumerate((~is_after, is_after)):
+            counts[row] += is_occupied[at_row].sum(), is_free[at_row].sum()
+    before, after = counts.tolist()
+    return Places(*before), Places(*after)
 
 
 def _returns_near(

@@ -144,8 +144,6 @@ def _basis(at_span: Float, num_spans: int) -> Float:
     return basis
 
 
-# Neighbour distance: least one, for noise and errors of registration, and share of the ring gap
-_NEAR_M, _NEAR_GAPS = 0.2, 0.5
 BESIDE_M = 1.0  # from a towing vehicle to its trailer, and from an object to the road
 _OUTLINE_M = 0.05  # distance outside an outline that still counts as inside
 LONG_M = 3.0  # objects shorter than this may bend, and need not move where they point
@@ -156,7 +154,7 @@ _BIN_M = 0.05  # bins of the histograms that show the sides
 
 def near_m(gap_m: Float | float) -> Any:
     """Return the neighbour distance (m): half the ring gap ``gap_m``, but at least 0.2 m."""
-    return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
+    return np.maximum(0.2, 0.5 * gap_m)  # 0.2 m: noise and errors of registration
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from densify.flow.surface_matching import Model
 from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
-from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
+from densify.flow.tracking.extent import two_columns_m
 from densify.flow.tracking.following import (
     FIT_M,
     MIN_POINTS,
@@ -82,13 +82,13 @@ class _Search:
         self._free = [np.ones(len(sweep.points), bool) for sweep in obstacles]
         self._objects = list[MovingObject]()
         self._follower = Follower(self.batches, self._free, ground, self.clock)
+        # For each batch, the fields of its sweeps with candidates
         self._fields: list[list[DistanceField]] = []
-        if velocities_m_s is None:
-            sweep_fields = [
-                DistanceField.of(sweep.points[sweep.candidate], sweep.time_s[sweep.candidate])
-                for sweep in obstacles
-            ]
-            self._fields = [[sweep_fields[j] for j in batch.sweeps] for batch in self.batches]
+        for batch in self.batches if velocities_m_s is None else ():
+            sweeps = [obstacles[j] for j in batch.sweeps if obstacles[j].candidate.any()]
+            self._fields.append(
+                [DistanceField.of(s.points[s.candidate], s.time_s[s.candidate]) for s in sweeps]
+            )
 
     def find_tracks(self) -> list[Track]:
         """Return the confirmed tracks; tracks from the best starting clusters come first."""
@@ -222,8 +222,8 @@ class _Search:
             clouds.append(track.place(track.in_object(self._obstacles[j], rows), at_s))
 
         T_lidar_world = space.T_lidar_world[next(iter(track.claimed))]
-        columns_m = columns_apart_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
-        gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LANE_M))
+        columns_m = two_columns_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
+        gap_m = float(np.clip(columns_m, *_GAPS_IN_LANE_M))
         # `link` joins points within `LINK_M`. Compressed along the heading by this ratio, points
         # with gaps up to ``gap_m`` are linked too.
         points = np.concatenate(clouds)
