@@ -115,7 +115,11 @@ def _flow_of_groups(
     shares, apart_s = _times_as_shares(clouds, times_ns)
     source_share, target_share = shares
     if apart_s is None and lidars is not None:
-        _separate_scanners(points, lidars)
+        # Without times, the points of two scanners cannot be compared: each measures an object at
+        # another time. Lifted by 1 km, they are out of reach of each other.
+        _, scanner = np.unique(np.concatenate(lidars), return_inverse=True)
+        for cloud, number in zip(points, np.split(scanner, [len(points[0])]), strict=True):
+            cloud[:, 2] += 1000.0 * number
     source_points, target_points = points
     motions, instance = find_movers(
         source=PairCloud(source_points[source_rows], source_share[source_rows]),
@@ -139,15 +143,6 @@ def _flow_of_groups(
         to_reference[rows] = at_reference - measured
     field.moving[:] = field.instance >= 0
     return field if apart_s is None else replace(field, to_reference=to_reference)
-
-
-def _separate_scanners(points: list[Float], lidars: tuple[Int, Int]) -> None:
-    """Lift the points of each scanner, in place, out of reach of the other scanners' points."""
-    # Without times, the points of two scanners cannot be compared: each measures an object at
-    # another time.
-    _, scanner = np.unique(np.concatenate(lidars), return_inverse=True)
-    for cloud, number in zip(points, np.split(scanner, [len(points[0])]), strict=True):
-        cloud[:, 2] += 1000.0 * number
 
 
 def _attach_below(points: Float, field: FlowField, low_rows: Int) -> None:

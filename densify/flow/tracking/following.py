@@ -213,7 +213,7 @@ _RECENT_S = 0.4  # age of the states that the rate is fitted to
 # Weight of the velocity that a track starts at: that of states with this sum of squared times, such
 # as two states 0.2 s apart
 _START_RATE_S2 = 0.02
-MAX_MISSED_S = 0.2  # a track ends if its object is not found in two batches and for a longer time
+MAX_MISSED_S = 0.2  # time without points after which a track ends
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
@@ -265,15 +265,14 @@ class Follower:
         for direction in (1, -1):
             last_found = start  # batch index
             n = start + direction
-            while 0 <= n < len(self.batches) and self._is_within_reach(last_found, n):
+            # An object that was not found in two batches may be found again within 0.2 s.
+            while 0 <= n < len(self.batches) and (
+                abs(n - last_found) <= 2 or self.clock.near(n, last_found, MAX_MISSED_S)
+            ):
                 if self._extend(track, model, rate, n):
                     last_found = n
                 n += direction
         return track
-
-    def _is_within_reach(self, last_found: int, n: int) -> bool:
-        """Return True if an object last found in a batch may be found again in batch n."""
-        return abs(n - last_found) <= 2 or self.clock.near(n, last_found, MAX_MISSED_S)
 
     def _extend(self, track: Track, model: Model, rate: Float, n: int) -> bool:
         """Add the object's points in batch n to both; False if too few points fit the model."""

@@ -236,12 +236,6 @@ class Track:
         clouds = (self.in_object(obstacles[j], self.claimed[j]) for j in sweeps)
         return np.concatenate([np.zeros((0, 3)), *clouds])
 
-    def rows_in(self, batch: Batch) -> Int:
-        """Return the indices, in the batch's obstacles, of the object's points."""
-        sweeps = zip(batch.sweeps, batch.begins, strict=True)
-        rows = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
-        return np.concatenate([np.zeros(0, np.int64), *rows])  # the first part: for no rows
-
     def num_points(self, n: int) -> int:
         """Return the number of the object's points in batch index n."""
         return sum(len(self.claimed[j]) for j in self.observations[n].sweeps)

@@ -181,7 +181,11 @@ class _Search:
         # In the first or the last batch, another side may be in view.
         track = best.track
         for end in sorted({min(track.observations), max(track.observations)} - {n}):
-            rows = track.rows_in(self.batches[end])
+            batch = self.batches[end]
+            sweeps = zip(batch.sweeps, batch.begins, strict=True)
+            rows = np.concatenate(
+                [track.claimed[j] + begin for j, begin in sweeps if j in track.claimed]
+            )
             if len(rows) >= MIN_POINTS:
                 restarted = self._follow(rows, end, self._likely_velocity(rows, end))
                 if restarted.track.total_points() >= 0.9 * track.total_points():
