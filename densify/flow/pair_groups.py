@@ -44,7 +44,8 @@ class PairCloud:
     """The N points of a cloud above the ground."""
 
     points: Float  # (N,3) metres
-    # (N,) share of the motion at the firing time: 0 at the source's reference time, 1 at the other
+    # (N,) share of the motion at the firing time: 0 at the reference time of the source, 1 at that
+    # of the target
     share: Float
 
     @cached_property

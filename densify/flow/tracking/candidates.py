@@ -168,7 +168,7 @@ def find_candidates(stretch: Stretch, space: FreeSpace, ground: HeightMap) -> tu
 def cluster_rings(
     points: Float, rows: Int, seed: Bool, registered: RegisteredSweep, sensors: Sensors
 ) -> tuple[int, Int]:
-    """Return the clusters of `cluster_around` for points (N,3), world, which are ``rows`` (N,).
+    """Return the clusters of a sweep's points (N,3), world, at ``rows``, see `cluster_around`.
 
     Heights are compressed until rings are at most 0.35 m apart. Otherwise the rings of an object
     would be too far apart to be linked.
@@ -190,13 +190,9 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Return the clusters of seeds and of points within 0.4 m of seeds, linked within 0.6 m.
+    """Return the clusters of seeds and of points (N,3) within 0.4 m of seeds, linked within 0.6 m.
 
     Seeds with a share of other seeds below 0.4 around them, as in a hedge, do not count.
-
-    Args:
-        points: (N,3) metres.
-        seed: (N,) True for seeds.
 
     Returns:
         The number of clusters, and (N,) labels from 0, -1 for points in no cluster.

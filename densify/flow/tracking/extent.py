@@ -251,12 +251,12 @@ def _free_rows_in_lane(
 
 
 def two_columns_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
-    """Return the distance (m) between the next but one columns of rays that hit a receding side.
+    """Return the distance (m) over two columns of rays on a side that recedes from the scanner.
 
-    The side contains a point (3,) and is along a unit vector (2,), both world.
+    The side contains a point (3,) and runs along a unit vector ``ahead`` (2,), both world.
     """
-    # One column may be missing. Two rays that differ by a small angle hit the side (angle x range²
-    # / distance of the side's line from the lidar) apart.
+    # Two columns, because one may lack returns. Two rays that differ by a small angle hit the side
+    # (angle x range² / distance of the side's line from the lidar) apart.
     in_lidar = poses.transform(T_lidar_world, point[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
     aside_m = max(abs(float(in_lidar @ [-y, x])), 1e-3)

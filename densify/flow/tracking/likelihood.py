@@ -218,7 +218,7 @@ def count_vacated_places(
 
     Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
     through from some directions only. Its vacated positions then hold returns of the fence. A
-    return of none of the other ``objects`` occupies a position within ``within_m`` of it.
+    return within ``within_m`` occupies a position, unless it is of one of the other ``objects``.
     """
     sweeps = list(track.claimed)
     samples = [
