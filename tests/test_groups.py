@@ -100,9 +100,9 @@ TURNING = car(26, 1.5, 5, 1, yaw=np.pi * 0.75, turn_rad_s=0.4, size_m=(9.0, 2.4,
     ("box", "speed_m_s", "scanner", "middle", "size", "expected"),
     [
         # its ends go different ways
-        (TURNING, 3.0, NOISE, KEY, 4, (3, 0.6, 0.5, 0.05)),
+        (TURNING, 3.0, NOISE, KEY, 4, (3, 0.6, 0.5, 0.05, 2e-4)),
         # a flat back that is followed for long: only its ends tell where it is, and errors add up
-        (car(10, -1.5, 6, 1), 4.0, FLAT_BACK, 8, 6, (3, 0.95, 0.9, 0.03)),
+        (car(10, -1.5, 6, 1), 4.0, FLAT_BACK, 8, 6, (3, 0.95, 0.9, 0.03, 1e-3)),
         # most of a long side that passes does not tell how fast: from farther away its front does
         (
             car(24 * PASSING_S, 3, 24, 1, yaw=np.pi, size_m=TRUCK_M),
@@ -110,25 +110,33 @@ TURNING = car(26, 1.5, 5, 1, yaw=np.pi * 0.75, turn_rad_s=0.4, size_m=(9.0, 2.4,
             Scanner(32, 540, (-24.8, 2.0), 0.01),
             7,
             6,
-            (6, 0.95, 0.9, 0.3),
+            (6, 0.95, 0.9, 0.3, 1e-3),
         ),
         # a truck 25 m ahead in the next lane, on which columns of rays lie more than a metre apart
-        (car(33, 2.2, 13, 1, size_m=TRUCK_M), 12.0, SIXTY_FOUR, KEY, 5, (3, 0.97, 0.95, 0.1)),
+        (car(33, 2.2, 13, 1, size_m=TRUCK_M), 12.0, SIXTY_FOUR, KEY, 5, (3, 0.97, 0.95, 0.1, 1e-3)),
         # a bus beside the scanner: only its ends are ever seen through
-        (car(4, 2.6, 3, 1, size_m=(18.0, 2.5, 3.0)), 6.0, NOISE, KEY, 4, (4, 0.99, 0.99, 0.08)),
+        (
+            car(4, 2.6, 3, 1, size_m=(18.0, 2.5, 3.0)),
+            6.0,
+            NOISE,
+            KEY,
+            4,
+            (4, 0.99, 0.99, 0.08, 1e-4),
+        ),
     ],
     ids=["turning truck", "flat back", "passing truck", "wide columns", "bus"],
 )
 def test_a_surface_that_hardly_shows_its_motion_is_one_object_and_does_not_slide(
     box, speed_m_s, scanner, middle, size, expected
 ):
-    """expected: sweeps around the key, share that moves, quantile of the errors and its bound."""
-    reach, least_moving, quantile, error_m = expected
+    """expected: sweeps around the key, least share that moves, quantile of the errors and its bound,
+    greatest share of static points that move."""
+    reach, least_moving, quantile, error_m, false_share = expected
     scene = Scene(World((*street(), box)), Arc(0, -1.5, 0, speed_m_s), scanner)
     found = Found.around(middle, scene, size)
     assert found.share_moving(1, reach) > least_moving
     assert np.quantile(found.errors_m(1, reach), quantile) < error_m
-    assert found.false_share() < 2e-4
+    assert found.false_share() < false_share
 
 
 def test_same_bytes_every_time(traffic):
