@@ -129,7 +129,7 @@ TURNING = car(26, 1.5, 5, 1, yaw=np.pi * 0.75, turn_rad_s=0.4, size_m=(9.0, 2.4,
 def test_a_surface_that_hardly_shows_its_motion_is_one_object_and_does_not_slide(
     box, speed_m_s, scanner, middle, size, expected
 ):
-    """expected: sweeps around the key, least share that moves, quantile of the errors and its bound,
+    """expected: sweeps around the key, least share that moves, quantile and bound of the errors,
     greatest share of static points that move."""
     reach, least_moving, quantile, error_m, false_share = expected
     scene = Scene(World((*street(), box)), Arc(0, -1.5, 0, speed_m_s), scanner)
