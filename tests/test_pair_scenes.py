@@ -69,16 +69,16 @@ def estimated(pair: Pair):
     )
 
 
-def check(pair: Pair, field, max_error_m: float = 0.08, least_moving: float = 0.8) -> None:
+def check(pair: Pair, field) -> None:
     """Movers found and right, everything else exactly where it was."""
     still = ~pair.moved
     assert field.moving[still].mean() <= 1e-3
     assert not field.displacement[~field.moving].any()
     for k in np.unique(pair.instance[pair.moved]):
         mine = pair.instance == k
-        assert field.moving[mine].mean() >= least_moving, k
+        assert field.moving[mine].mean() >= 0.8, k
         error = np.linalg.norm(field.displacement - pair.truth, axis=1)[mine & field.moving]
-        assert error.mean() <= max_error_m, k
+        assert error.mean() <= 0.08, k
 
 
 @pytest.mark.parametrize("speed_m_s", [5, 15, 30])
@@ -107,8 +107,10 @@ def test_similar_cars_in_a_row_keep_their_places():
 def test_rings_that_lie_elsewhere_on_a_near_car_are_no_misfit(timed):
     """Sixteen rings: hardly a point of the car has a neighbour where it went."""
     pair = pair_of(car(5.0, 3.0, 14.0, 1), num_beams=16)
-    assert pair.moved.sum() > 300
-    check(pair, estimated(pair) if timed else estimate_flow(pair.source, pair.target), 0.03, 0.9)
+    field = estimated(pair) if timed else estimate_flow(pair.source, pair.target)
+    assert pair.moved.sum() > 300 and field.moving[pair.moved].mean() > 0.9
+    error_m = np.linalg.norm(field.displacement - pair.truth, axis=1)
+    assert error_m[pair.moved & field.moving].mean() < 0.03
 
 
 def test_without_the_ground():
