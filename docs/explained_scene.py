@@ -21,7 +21,6 @@ from densify.config.cache import Cache
 from densify.depth.exposure import Exposure, key_shots, load_images
 from densify.depth.rays import MovingBody
 from densify.flow.engines import Scene
-from densify.flow.tracking.candidates import Obstacles
 from densify.free_space.ground import ground
 from densify.geometry import poses
 from densify.geometry.types import Cloud, DepthMap, ObjectTrack, Stretch, Sweep
@@ -64,8 +63,7 @@ def explained() -> Explained:
     scene = scene_of(recording, KEY, shots, images, None, cloud, False, Watch())
     seen = see(scene, "flow", cloud)
     search = Scene(window, ground(window))
-    obstacles = [Obstacles.of(window, i, found) for i, found in enumerate(search.candidates)]
-    seen_through = np.concatenate([one.points[one.seed] for one in obstacles])
+    seen_through = np.concatenate([one.points[one.seed] for one in search.obstacles])
     return Explained(
         window,
         cloud,

@@ -19,7 +19,6 @@ from scipy.special import expit
 import densify
 from densify.config import resolve
 from densify.flow.engines import Scene
-from densify.flow.tracking.candidates import Obstacles
 from densify.flow.tracking.likelihood import fitted_weights
 from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.ground import ground
@@ -82,7 +81,7 @@ def tried_in(stretch, heights, truth):
     """Return the evidence of each track of a stretch, the share of its points that move, and their
     mean error and way (m) to the next sweep."""
     scene, found = Scene(stretch, heights), []
-    obstacles = [Obstacles.of(stretch, i, c) for i, c in enumerate(scene.candidates)]
+    obstacles = scene.obstacles
     moving = [truth.sweep(s.frame).moving[s.sweep.row] for s in stretch.sweeps]
 
     steps = list(zip(stretch.sweeps, stretch.frames[1:], strict=False))

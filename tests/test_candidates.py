@@ -39,8 +39,7 @@ def space(stretch) -> FreeSpace:
 
 @pytest.fixture(scope="module")
 def obstacles(stretch, space) -> tuple[Obstacles, ...]:
-    found = find_candidates(stretch, space, ground(stretch))
-    return tuple(Obstacles.of(stretch, i, candidates) for i, candidates in enumerate(found))
+    return find_candidates(stretch, space, ground(stretch))
 
 
 def test_obstacles_are_the_points_above_the_ground(scene, stretch, obstacles):

@@ -24,14 +24,22 @@ from tests.exact_motion import (
 )
 
 
-@pytest.mark.parametrize("body", [drifting, turning])
-def test_steps_compose_exactly_though_every_sweep_has_other_points(body):
-    motion = scene(body)
+@pytest.mark.parametrize(
+    ("body", "num_points"),
+    [(drifting, NUM_MOVING), (turning, NUM_MOVING), (drifting, 1), (drifting, 2)],
+)
+def test_steps_compose_exactly_though_every_sweep_has_other_points(body, num_points):
+    """Objects of one or two points move without turning. The velocity is that of the last step."""
+    motion = scene(body, sizes=dict.fromkeys(FRAMES, num_points))
     for frame, target in PAIRS:
         flow = motion.flow(frame, target)
         found = in_world(frame, flow.displacement)[NUM_STATIC:]
         np.testing.assert_allclose(found, true_flow(motion, frame, target, body), atol=1e-9)
         assert not flow.lost.any()
+        if body is drifting:
+            velocity_m_s = in_world(frame, flow.velocity_m_s)[NUM_STATIC:]
+            expected_m_s = np.tile([15.0, -5.0, 1.0], (num_points, 1))
+            np.testing.assert_allclose(velocity_m_s, expected_m_s, atol=1e-6)
 
 
 def test_each_step_is_asked_for_once_when_needed_and_never_written_to():
@@ -44,13 +52,13 @@ def test_each_step_is_asked_for_once_when_needed_and_never_written_to():
         return given[here, there]
 
     watched = ChainedMotion(motion.stretch, step)
-    watched.flow(101, KEY)
-    assert set(given) == {(1, 2), (2, 3)}
-    watched.flow(100, KEY)
-    assert set(given) == {(0, 1), (1, 2), (2, 3)}
-    watched.flow(100, KEY + 1)
-    watched.flow(KEY + 1, KEY)
-    assert set(given) == {(0, 1), (1, 2), (2, 3), (3, 4), (4, 3)}
+    for frame, target, asked in (
+        (101, KEY, {(1, 2), (2, 3)}),
+        (100, KEY, {(0, 1), (1, 2), (2, 3)}),
+        (100, KEY + 1, {(0, 1), (1, 2), (2, 3), (3, 4)}),
+    ):
+        watched.flow(frame, target)
+        assert set(given) == asked
     for pair, field in given.items():
         assert field.displacement.tobytes() == motion.step(*pair).displacement.tobytes()
         assert field.velocity_m_s is None and not field.lost.any()
@@ -69,14 +77,6 @@ def test_lost_where_a_sweep_in_between_has_nothing_of_the_object(missing):
         if not behind:
             found = in_world(frame, flow.displacement)[NUM_STATIC:]
             np.testing.assert_allclose(found, true_flow(motion, frame, target), atol=1e-9)
-
-
-@pytest.mark.parametrize("num_points", [1, 2])
-def test_objects_of_one_or_two_points_move_without_turning(num_points):
-    motion = scene(drifting, sizes=dict.fromkeys(FRAMES, num_points))
-    for frame, target in PAIRS:
-        found = in_world(frame, motion.flow(frame, target).displacement)[NUM_STATIC:]
-        np.testing.assert_allclose(found, true_flow(motion, frame, target, drifting), atol=1e-9)
 
 
 def test_what_is_not_rigid_follows_its_nearest():
@@ -106,16 +106,13 @@ def everything_moves(gap_m: float) -> ChainedMotion:
     return chained(points, lambda f, t: np.tile(ahead * (t - f), (200, 1)), nobody)
 
 
-def test_points_without_an_object_follow_the_nearest():
+def test_points_without_an_object_follow_the_nearest_and_are_lost_over_a_gap():
     motion = everything_moves(gap_m=0.0)
     for frame, target in PAIRS:
         flow = motion.flow(frame, target)
         assert flow.moving.all() and not flow.lost.any()
         expected = np.tile([0.4 * (target - frame), 0, 0], (200, 1))
         np.testing.assert_allclose(in_world(frame, flow.displacement), expected, atol=1e-9)
-
-
-def test_points_without_an_object_are_lost_over_a_gap():
     motion = everything_moves(gap_m=20.0)
     y = in_world(KEY, motion.stretch[KEY].sweep.points)[:, 1] + T_world_lidar(KEY)[1, 3]
     before = motion.flow(KEY - 2, KEY)
@@ -123,12 +120,3 @@ def test_points_without_an_object_are_lost_over_a_gap():
     assert motion.flow(KEY - 3, KEY).lost[y > 0.6].all()  # and stays lost farther out
     assert not motion.flow(KEY + 2, KEY).lost.any()
     assert not everything_moves(0.45).flow(KEY - 2, KEY).lost.any()
-
-
-def test_the_velocity_is_that_of_the_last_step():
-    motion = scene(drifting)
-    for frame, target in PAIRS:
-        velocity_m_s = in_world(frame, motion.flow(frame, target).velocity_m_s)[NUM_STATIC:]
-        np.testing.assert_allclose(
-            velocity_m_s, np.tile([15.0, -5.0, 1.0], (NUM_MOVING, 1)), atol=1e-6
-        )

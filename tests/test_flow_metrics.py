@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from densify.readers.flow_files import CATEGORIES
-from densify.scores import flow_metrics as metrics
+from densify.scores import metrics
 from densify.scores.metrics import CLASSES, IGNORED, challenge_scores
 
 NAMES = ("NONE", *CATEGORIES)

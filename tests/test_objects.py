@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Tracked objects: their motion, the flow that follows from it, and their shape."""
+"""Tracked objects: their motion, the flow that follows from it, shape, path, and alignment."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from densify.flow.surface_matching import apply
+from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.groups import GroupMotion
 from densify.flow.tracking.objects import MovingObject, Observation, Path, Shape, Track
 from densify.free_space.ground import HeightMap
@@ -98,7 +99,7 @@ def test_the_ground_rises_under_a_track():
 
 
 def test_the_outline_is_that_of_all_points_seen_from_above() -> None:
-    """A triangle, 5 cm beyond its sides allowed."""
+    """A triangle, 5 cm beyond its sides allowed. A line has no outline."""
     corners = np.array([[0.0, 0, 0], [4, 0, 1], [0, 3, 9]])
     rng = np.random.default_rng(0)
     shape = Shape.of(np.concatenate([corners, rng.dirichlet(np.ones(3), 500) @ corners]))
@@ -106,14 +107,10 @@ def test_the_outline_is_that_of_all_points_seen_from_above() -> None:
     x, y, _ = asked.T
     beyond = np.max([-x, -y, (3 * x + 4 * y - 12) / 5], axis=0)
     np.testing.assert_array_equal(shape.within_outline(asked), beyond < 0.05)
-
-
-@pytest.mark.parametrize("num_points", [1, 2, 30])
-def test_a_line_has_no_outline(num_points: int) -> None:
-    line = np.linspace(0, 1, num_points)[:, None] * [1.0, 2.0, 3.0]
-    shape = Shape.of(line)
-    assert not shape.within_outline(line).any()
-    np.testing.assert_array_equal(shape.rim, line)
+    line = np.linspace(0, 1, 30)[:, None] * [1.0, 2.0, 3.0]
+    for points in (line[:1], line[:2], line):
+        assert not Shape.of(points).within_outline(line).any()
+        np.testing.assert_array_equal(Shape.of(points).rim, points)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 2.0])
@@ -163,3 +160,201 @@ def test_a_long_object_heads_along_its_side_and_a_short_one_where_it_moves(
     x, y = MovingObject(track, shape).heading(0.2)
     assert np.hypot(x, y) == pytest.approx(1)
     assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(heading_deg, abs=1)
+
+
+# --- paths ----------------------------------------------------------------------------------------
+
+
+STEP_S = 0.1
+NOISE_M = 0.03
+SEEDS = range(10)
+
+
+def times_of(num: int, begin_s: float = 0.37) -> np.ndarray:
+    """Not quite even: an object is seen a little earlier or later as the scanner comes by."""
+    return begin_s + STEP_S * np.arange(num) + np.random.default_rng(num).uniform(0, 0.01, num)
+
+
+def polynomial(times_s: np.ndarray, degree: int) -> np.ndarray:
+    """(m,4) x y z yaw."""
+    rng = np.random.default_rng(degree)
+    return np.vander(np.asarray(times_s), degree + 1) @ rng.uniform(-8, 8, (degree + 1, 4))
+
+
+def fitted(times_s: np.ndarray, states: np.ndarray) -> Path:
+    return Path.fit(times_s, states, np.ones(len(times_s)))
+
+
+def rms(off: np.ndarray) -> float:
+    """In the plane."""
+    return float(np.sqrt((off[:, :2] ** 2).sum(1).mean()))
+
+
+@pytest.mark.parametrize(("degree", "num"), [(1, 4), (2, 5), (2, 40)])
+def test_constant_acceleration_is_recovered_exactly_and_of_few_sweeps_constant_velocity(
+    degree, num
+):
+    t = times_of(num)
+    path = fitted(t, polynomial(t, degree))
+    within = np.linspace(t[0], t[-1], 50)
+    np.testing.assert_allclose(path(within), polynomial(within, degree), atol=1e-5)
+    assert path.residual_m < 1e-5
+
+
+def from_rest(times_s: np.ndarray) -> np.ndarray:
+    """Stands for half a second, then sets off at 5 m/s²."""
+    x = 2.5 * np.maximum(times_s - times_s[0] - 0.5, 0) ** 2
+    return np.stack([x, 0.5 * x, 0 * x, 0.02 * x], 1)
+
+
+def to_a_stop(times_s: np.ndarray) -> np.ndarray:
+    """6 m/s, brakes at 8 m/s², stands."""
+    after_s = np.clip(times_s - times_s[0] - 0.2, 0, 0.75)
+    x = 6 * (np.minimum(times_s - times_s[0], 0.2) + after_s) - 4 * after_s**2
+    return np.stack([x, -0.3 * x, 0 * x, 0 * x], 1)
+
+
+def noisy(states: np.ndarray, seed: int) -> np.ndarray:
+    return states + np.random.default_rng(seed).normal(0, NOISE_M, states.shape)
+
+
+@pytest.mark.parametrize("motion", [from_rest, to_a_stop])
+def test_starts_and_stops_are_followed_better_than_by_a_quadratic(motion):
+    t = times_of(15)
+    path_m, quadratic_m = [], []
+    for seed in SEEDS:
+        measured = noisy(motion(t), seed)
+        path_m.append(rms(fitted(t, measured)(t) - motion(t)))
+        quadratic = np.vander(t - t[0], 3)
+        coefficients = np.linalg.lstsq(quadratic, measured, rcond=None)[0]
+        quadratic_m.append(rms(quadratic @ coefficients - motion(t)))
+    assert np.mean(path_m) < 0.75 * np.mean(quadratic_m)
+    assert np.mean(path_m) < NOISE_M * np.sqrt(2)  # better than the single sweep
+
+
+def test_a_quadratic_with_noise_stays_one():
+    """What softness could explain is only noise: the third derivative remains nothing."""
+    t = times_of(11)
+    num_stiff = 0
+    for seed in SEEDS:
+        rate = fitted(t, noisy(polynomial(t, 2), seed)).rate(np.linspace(t[0], t[-1], 9))
+        num_stiff += np.abs(np.diff(rate, 2, axis=0)).max() < 1e-3
+    assert num_stiff >= 0.75 * len(SEEDS)
+
+
+@pytest.mark.parametrize("num", [3, 4])
+def test_four_sweeps_do_not_tell_an_acceleration(num):
+    t = times_of(num)
+    rate = fitted(t, polynomial(t, 2)).rate(np.linspace(t[0], t[-1], 9))
+    assert np.ptp(rate, axis=0).max() < 1e-3
+    t = times_of(5)
+    rate = fitted(t, polynomial(t, 2)).rate(np.linspace(t[0], t[-1], 9))
+    assert np.ptp(rate, axis=0).max() > 1
+
+
+@pytest.mark.parametrize("num", [5, 11])
+def test_the_residual_of_noise_is_about_the_noise(num):
+    """Though the fit swallows some of it."""
+    t = times_of(num)
+    found_m = [fitted(t, noisy(polynomial(t, 2), seed)).residual_m for seed in range(60)]
+    expected_m = NOISE_M * np.sqrt(2)  # of two coordinates
+    assert 0.75 * expected_m < np.sqrt(np.mean(np.square(found_m))) < 1.3 * expected_m
+
+
+def test_beyond_the_ends_it_goes_on_at_constant_velocity():
+    t = times_of(15)
+    soft = fitted(t, from_rest(t))
+    for end_s, sign in ((soft.begin_s, -1), (soft.end_s, 1)):
+        velocity = soft.rate(end_s)
+        for beyond_s in (0.01, 0.2, 3.0):
+            there = soft(end_s + sign * beyond_s)
+            np.testing.assert_allclose(there, soft(end_s) + sign * beyond_s * velocity, atol=1e-9)
+            np.testing.assert_allclose(soft.rate(end_s + sign * beyond_s), velocity)
+    assert soft.rate(soft.end_s + 1)[0] > 3 and abs(soft.rate(soft.begin_s - 1)[0]) < 1
+
+
+def test_rounding_of_the_last_knot_leaves_the_last_state_on_the_path():
+    """0.1 s times the number of spans may end a rounding error before the last time."""
+    for times_s in np.sort(np.random.default_rng(0).uniform(-1, 1, (300, 2)), axis=1):
+        assert np.isfinite(fitted(times_s, np.ones((2, 4))).residual_m)
+
+
+# --- alignment ------------------------------------------------------------------------------------
+
+
+MIDDLE = np.array([12.0, -3.0, 0.8])
+STD = np.array([0.3, 0.3, 0.06])
+
+
+def corner(num_points: int, seed: int) -> np.ndarray:
+    """Two sides of a car, as seen from one place."""
+    rng = np.random.default_rng(seed)
+    along, up = rng.uniform([-2, 0], [2, 1.4], (num_points, 2)).T
+    side = np.arange(num_points) % 3 > 0
+    x, y = np.where(side, along, -2.0), np.where(side, -0.9, along * 0.45)
+    return MIDDLE + np.stack([x, y, up], 1) + rng.normal(0, 0.01, (num_points, 3))
+
+
+def slow_information(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """(N,3,3) as the formulas say, with an inverse of numpy."""
+    x = points[near] - points[near].mean(1, keepdims=True)
+    covariance = 10 * np.einsum("nki,nkj->nij", x, x) / near.shape[1]
+    mean_variance = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / 3
+    return np.linalg.inv(covariance + (0.05**2 + 0.02 * mean_variance) * np.eye(3))
+
+
+def slow_align(model: Model, points, predicted) -> np.ndarray | None:
+    """Gauss-Newton with numerical derivatives, neighbours from another tree."""
+    tree = cKDTree(model.points)
+    _, near = tree.query(model.points, min(12, len(model.points)))
+    information = slow_information(model.points, near.reshape(len(model.points), -1))
+    state, points = predicted.copy(), points[:: max(1, len(points) // 250)]
+    for gate_m in GATES_M:
+        at_model = undo(state, points, MIDDLE)
+        distance, row = tree.query(at_model, distance_upper_bound=gate_m)
+        near = np.isfinite(distance)
+        if near.sum() < MIN_FIT:
+            return None
+        weight = (1 - (distance[near] / gate_m) ** 2) ** 2 * min(1, 60 / near.sum())
+        A = information[row[near]] * weight[:, None, None]
+        r = at_model[near] - model.points[row[near]]
+        J = np.zeros((near.sum(), 3, 3))
+        for k, axis in enumerate((0, 1, 3)):
+            h = np.zeros(4)
+            h[axis] = 1e-6
+            ahead, behind = (undo(state + s * h, points[near], MIDDLE) for s in (1, -1))
+            J[:, :, k] = (ahead - behind) / 2e-6
+        H = np.einsum("nik,nij,njl->kl", J, A, J) + np.diag(1 / STD**2)
+        g = np.einsum("nik,nij,nj->k", J, A, r) - (predicted - state)[[0, 1, 3]] / STD**2
+        state[[0, 1, 3]] -= np.linalg.solve(H, g)
+    return state
+
+
+@pytest.mark.parametrize("num_points", [MIN_FIT - 1, MIN_FIT, 40, 600])
+@pytest.mark.parametrize("num_in_model", [8, 900, 2500])
+@pytest.mark.parametrize("flat", [False, True])
+def test_the_alignment_is_its_slow_twin(flat: bool, num_in_model: int, num_points: int) -> None:
+    rng = np.random.default_rng(0)
+    shape = corner(num_in_model, 0)
+    model = Model(np.where(np.arange(3) == 1, MIDDLE, shape) if flat else shape)
+    true = np.array([*rng.normal(0, 0.5, 2), rng.normal(0, 0.1), rng.normal(0, 0.3)])
+    points = apply(true, corner(num_points, 50), MIDDLE)
+    predicted = true + [*rng.normal(0, 0.2, 2), 0.0, rng.normal(0, 0.04)]
+    found, expected = (
+        model.align(points, MIDDLE, predicted, STD),
+        slow_align(model, points, predicted),
+    )
+    assert (found is None) == (expected is None) and (num_points >= MIN_FIT or found is None)
+    if found is not None:
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        assert found[2] == predicted[2]
+
+
+def test_the_prediction_holds_what_the_points_leave_open() -> None:
+    """A single flat side may slide along itself: it stays where it is expected."""
+    rng = np.random.default_rng(3)
+    wall = MIDDLE + np.column_stack([rng.uniform(-9, 9, 800), np.zeros(800), np.zeros(800)])
+    seen = MIDDLE + np.column_stack([rng.uniform(-1, 1, 80), np.zeros(80), np.zeros(80)])
+    predicted = np.array([0.3, 0.2, 0.0, 0.0])
+    found = Model(wall).align(seen, MIDDLE, predicted, np.array([0.01, 0.3, 0.06]))
+    assert abs(found[0] - 0.3) < 0.02 and abs(found[1]) < 0.02

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where tracks start, and the test that confirms them."""
+"""Where tracks start and how fast, and the test that confirms them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from densify.flow.tracking.candidates import Obstacles, find_candidates
-from densify.flow.tracking.following import find_starts
+from densify.flow.tracking.following import DistanceField, Group, find_starts, vote
 from densify.flow.tracking.likelihood import (
     Evidence,
     Places,
@@ -23,6 +23,7 @@ from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.ground import ground
 from densify.free_space.range_image import FreeSpace
 from densify.geometry.clock import Clock
+from densify.geometry.types import Float
 from tests.scenes import SWEEP_S, Arc, Box, Scanner, Scene, World, car, street
 
 PERIOD_NS = 100_000_000
@@ -63,32 +64,14 @@ def test_few_points_or_few_seeds_start_nothing(size, seed_share, starts_one):
 
 # --- the odds, by their figures -------------------------------------------------------------------
 
-SURE = Evidence(Violations(200, 0, 300), Places(0, 100), Places(0, 100), 30.0, 0.1, 1.0)
-
-
-def odds(**changed: object) -> float:
-    return SURE._replace(**changed).log_odds(fitted_weights())
-
-
-@pytest.mark.parametrize(
-    "worse",
-    [
-        {"violations": Violations(10, 0, 300)},  # few violations if static
-        {"violations": Violations(200, 120, 300)},  # the motion does not explain them
-        {"before": Places(100, 0), "after": Places(100, 0)},  # a fence goes on, on both sides
-        {"after": Places(100, 0)},
-        {"distance": 1.0},  # a short way
-        {"roughness": 1.0},  # off the smooth path
-        {"slenderness": 5.0},  # a rail that moves along itself
-    ],
-)
-def test_each_term_speaks_against_a_track(worse):
-    assert odds(**worse) < odds() - 1
-
 
 @pytest.mark.parametrize(
     ("evidence", "moves"),
     [
+        # free behind and ahead of it, and a motion that explains all violations
+        (((200, 0, 300), (0, 100), (0, 100), 30.0, 0.1, 1.0), True),
+        # few violations if static; a short way; off the smooth path
+        (((10, 0, 300), (0, 100), (0, 100), 1.0, 1.0, 1.0), False),
         # limbs swing: violations are left
         (((200, 80, 700), (0, 30), (0, 30), 7.0, 0.1, 1.0), True),
         # the rest of a long object is there, on either side
@@ -128,8 +111,7 @@ def test_the_weights_separate_the_tracks_of_a_street_that_had_no_part_in_the_fit
     scene = Scene(World((*street(), *leaves, *movers, walker)), EGO, scanner)
     stretch = scene.stretch(KEY, 5)
     space, heights = FreeSpace.of(stretch), ground(stretch)
-    found = find_candidates(stretch, space, heights)
-    obstacles = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]
+    obstacles = find_candidates(stretch, space, heights)
     shares, log_odds = [], []
 
     def record(track, evidence):
@@ -160,8 +142,7 @@ class Seen:
         self.scene = Scene(World((*street(), *boxes)), EGO, Scanner(sigma_m=0.01))
         stretch = self.scene.stretch(KEY, 5)
         self.space = FreeSpace.of(stretch)
-        found = find_candidates(stretch, self.space, ground(stretch))
-        self.obstacles = [Obstacles.of(stretch, i, c) for i, c in enumerate(found)]
+        self.obstacles = find_candidates(stretch, self.space, ground(stretch))
 
     def track(self, boxes: list[int], begin_m: float) -> Track:
         """The returns of these boxes in a frame of 4.4 m that moves along; begin_m: where it begins
@@ -199,3 +180,54 @@ def test_a_car_moves_though_others_go_close_before_and_behind():
     taken = [row.places(middle, *known)[:, 0] for known in ((), (first,), (first, last))]
     assert (taken[0] > 20 * taken[2]).all() and taken[1].sum() > 20 * taken[2].sum()
     assert judge(middle, row.obstacles, row.space, []).moves
+
+
+# --- votes ----------------------------------------------------------------------------------------
+
+
+def _nearness(field: DistanceField, group: Group, velocities: Float) -> Float:
+    found = np.zeros((len(velocities), len(group.points)), np.uint8)
+    field.raise_nearness(found, group, velocities)
+    return found / 255
+
+
+def test_the_field_is_the_distance_between_voxels() -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, 4, (300, 3)) + [100, -50, 0]
+    field = DistanceField.of(points, np.ones(300))
+    asked = rng.uniform(-2, 6, (3000, 3)) + [100, -50, 0]
+    voxel, occupied = (np.floor((p - field.low) / 0.2) for p in (asked, points))
+    distance_m = 0.2 * np.linalg.norm(voxel[:, None] - occupied[None], axis=2).min(1)
+    share = np.round(255 * np.minimum(distance_m / 0.6, 1)) / 255
+    assert (share < 1).mean() > 0.1
+    # A second before the points of the field, from the origin.
+    found = _nearness(field, Group.of(np.zeros((1, 3)), np.zeros(1)), asked)
+    np.testing.assert_allclose(1 - found[:, 0], share, atol=1e-12)
+    together = Group.of(asked[:7] - asked[0], np.zeros(7))
+    np.testing.assert_allclose(1 - _nearness(field, together, asked[:1])[0], share[:7], atol=1e-12)
+
+
+@pytest.mark.parametrize("num_together", [1, 2])
+@pytest.mark.parametrize("early_s", [0.0, 0.008])
+def test_what_passes_is_measured_earlier_or_later_in_each_sweep(
+    num_together: int, early_s: float
+) -> None:
+    """A car passes at 27 m/s, and each sweep measures it a little earlier in its turn than the one
+    before: by the sweeps' own times it would be 2.2 m/s slower. Points of one sweep, and sweeps of
+    one look, have times of their own too."""
+    body = np.random.default_rng(3).uniform([-2.2, -0.9, 0], [2.2, 0.9, 1.4], (240, 3))
+    body[:, 1] = np.where(np.abs(body[:, 0]) < 2.1, 0.9, body[:, 1])  # a side and both ends
+    period_s, velocity = 0.1 / num_together, np.array([27.0, 0.4, 0.0])
+    time_s = [
+        period_s * i - early_s / num_together * (i - 5 * num_together) + 0.002 * body[:, 0]
+        for i in range(11 * num_together)
+    ]
+    seen = [body + t[:, None] * velocity for t in time_s]
+    of_sweeps = [DistanceField.of(p, t) for p, t in zip(seen, time_s, strict=True)]
+    looks = [range(n * num_together, (n + 1) * num_together) for n in range(11)]
+    middle_ns = [round(np.mean([period_s * j for j in look]) * 1e9) for look in looks]
+    group = Group.of(*(np.concatenate([part[j] for j in looks[5]]) for part in (seen, time_s)))
+    found = vote(
+        group, 5, [[of_sweeps[j] for j in look] for look in looks], Clock(np.array(middle_ns))
+    )
+    np.testing.assert_allclose(found, velocity, atol=0.25)

@@ -20,16 +20,16 @@ from typing import Any
 
 import numpy as np
 
-from densify.config import Config, resolve
+from densify.config import Config, ObjectiveSettings, resolve
 from densify.config.errors import InputError
-from densify.flow.objective import SolverSettings, solve
+from densify.flow.objective import solve
 from densify.flow.two_clouds import estimate_flow
 from densify.geometry.types import Bool, Float, Int, Progress
 from densify.learning.network import AboveGround, Sweeps, read_model
 from densify.learning.training import make_clip, sample_of
 from densify.readers import open_sequence
 from densify.readers.decoded_files import read_arrays
-from densify.scores import flow_metrics as metrics
+from densify.scores import metrics
 
 FARTHEST_M = 35.0
 NUM_POINTS = 2048
@@ -38,7 +38,6 @@ PUBLISHED: Mapping[str, Mapping[str, float]] = {
     "kitti": {"epe_m": 0.093, "within_5": 0.648, "within_10": 0.821, "angle_rad": 0.137},
 }
 """The paper's published scores without learning, by data set."""
-_MAX_SWEEPS = 5
 _SEED = 0
 _FLYINGTHINGS = ("points1", "points2", "flow")  # names of source, target and flow in a file
 _KITTI = ("pos1", "pos2", "gt")
@@ -67,7 +66,7 @@ It returns the flow of the drawn source points."""
 
 def _objective(solver: str, **settings: Any) -> Flow:
     """Return a method of scene flow that minimises the paper's objective by a named solver."""
-    chosen = SolverSettings(solver=solver, **settings)
+    chosen = ObjectiveSettings(solver=solver, **settings)
     return lambda pair, rows, targets: solve(pair.source[rows], pair.target[targets], chosen).flow
 
 
@@ -187,7 +186,7 @@ def pair_of_recording(spec: str, key: int) -> PaperPair:
     row = next(row for row, sweep in enumerate(clip) if not sweep.origin_m.any())  # the key's
     if row + 1 == len(clip):
         raise InputError(f"--data {spec}: no sweep after {key}; choose an earlier one")
-    sample = sample_of(clip, row, row + 1, _MAX_SWEEPS)
+    sample = sample_of(clip, row, row + 1)
     source, target = (clip[n].points.astype(np.float64) for n in (row, row + 1))
     flow, moving = sample.flow.double().numpy(), sample.moving.numpy()
     return PaperPair(f"{spec}@{key}", source, target, flow, moving, sample.sweeps)

@@ -12,7 +12,6 @@ from densify.geometry import poses
 from densify.geometry.nearest import nearest_k, tree_of
 from densify.geometry.types import Float, FlowField, Int, Stretch
 
-_NUM_NEIGHBORS = 3  # points whose deviations are averaged
 # Singular value (m, the root of the sum of squares) of the scatter across a line, below which
 # points count as on the line: they do not determine a rotation about it.
 _LINE_M = 0.05
@@ -40,12 +39,9 @@ class ChainedMotion:
 
         The flow to ``frame`` itself is 0, with the labels of the step to a neighbouring sweep.
         """
-        i = self.stretch.frames.index(frame)
-        j = self.stretch.frames.index(target)
-        return self._zero_flow(i) if i == j else self._flow(i, j)
-
-    def _zero_flow(self, i: int) -> FlowField:
-        """Return the flow of sweep index i to itself: 0, with labels of the step to a neighbour."""
+        i, j = self.stretch.frames.index(frame), self.stretch.frames.index(target)
+        if i != j:
+            return self._flow(i, j)
         num_sweeps = len(self.stretch.sweeps)
         if num_sweeps == 1:
             return FlowField.zero(len(self.stretch.sweeps[i].sweep))
@@ -57,18 +53,13 @@ class ChainedMotion:
         if (i, j) not in self._flows:
             neighbour = i + (1 if j > i else -1)  # next to sweep i, towards j
             if neighbour == j:
-                flow = self._add_velocity(self.step(i, j), i, j)
+                step, sweeps = self.step(i, j), self.stretch.sweeps
+                duration_s = (sweeps[j].sweep.stamp_ns - sweeps[i].sweep.stamp_ns) * 1e-9
+                flow = replace(step, velocity_m_s=step.displacement / duration_s)
             else:
                 flow = self._follow(i, neighbour, self._flow(neighbour, j))
             self._flows[i, j] = flow
         return self._flows[i, j]
-
-    def _add_velocity(self, step: FlowField, i: int, j: int) -> FlowField:
-        """Return the flow of sweep index i to j with its mean velocity."""
-        stamp_i_ns = self.stretch.sweeps[i].sweep.stamp_ns
-        stamp_j_ns = self.stretch.sweeps[j].sweep.stamp_ns
-        velocity_m_s = step.displacement / ((stamp_j_ns - stamp_i_ns) * 1e-9)
-        return replace(step, velocity_m_s=velocity_m_s)
 
     def _follow(self, i: int, neighbour: int, onward: FlowField) -> FlowField:
         """Chain the flow of sweep i to its neighbour with ``onward``, from there to the target."""
@@ -76,8 +67,7 @@ class ChainedMotion:
         sweep, next_sweep = self.stretch.sweeps[i], self.stretch.sweeps[neighbour]
         T_next_lidar = self.stretch.T_target_source(next_sweep.frame, sweep.frame)
         R_next_lidar = T_next_lidar[:3, :3]
-        displacement = step.displacement.copy()
-        lost = step.lost.copy()
+        displacement, lost = step.displacement.copy(), step.lost.copy()
         velocity_m_s = np.zeros_like(displacement)
         # (M,3) points of the neighbour at its reference time. The total flow is the motion to this
         # time plus the displacement to the target.
@@ -91,7 +81,7 @@ class ChainedMotion:
             # Where the step brings the points of sweep i, and the object's points around there
             arrived = poses.transform(T_next_lidar, sweep.sweep.points[rows] + step.total[rows])
             members = next_points[next_rows]
-            gap_m, nearest = nearest_k(tree_of(members), arrived, _NUM_NEIGHBORS)
+            gap_m, nearest = nearest_k(tree_of(members), arrived, 3)
             weight = 1 / (gap_m + 1e-3)  # 1 mm avoids a division by 0
             weight /= weight.sum(axis=1, keepdims=True)
             if instance >= 0:

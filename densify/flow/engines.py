@@ -10,7 +10,7 @@ from typing import Protocol, cast
 
 from densify.config import Config
 from densify.config.plugins import engine
-from densify.flow.tracking.candidates import Candidates, find_candidates
+from densify.flow.tracking.candidates import Obstacles, find_candidates
 from densify.free_space.ground import HeightMap
 from densify.free_space.range_image import FreeSpace
 from densify.geometry.types import Motion, Stretch
@@ -31,7 +31,7 @@ class Scene:
         return FreeSpace.of(self.stretch)
 
     @cached_property
-    def candidates(self) -> tuple[Candidates, ...]:
+    def obstacles(self) -> tuple[Obstacles, ...]:
         """The points of each sweep above the ground, and which of them may move."""
         return find_candidates(self.stretch, self.space, self.ground)
 
@@ -70,13 +70,8 @@ class EngineModule(Protocol):
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
     """Return the motion of all points in a scene, by one scene flow engine.
 
-    Args:
-        scene: Registered sweeps, their ground and free space.
-        settings: Configuration of the run.
-        spec: Engine as ``NAME`` or ``NAME:ARGUMENT``, such as ``groups``; None for ``flow.engine``.
-
-    Raises:
-        InputError: No engine has this name, or the engine rejects its argument.
+    It is the engine ``spec``, as ``NAME`` or ``NAME:ARGUMENT``, or that of the settings. InputError
+    is raised for an unknown name, or an argument that the engine rejects.
     """
     plugin, argument = engine(spec or settings.flow.engine)
     module = cast(EngineModule, plugin.load_module())

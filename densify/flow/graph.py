@@ -38,7 +38,7 @@ def checked_cloud(values: ArrayLike, name: str) -> Float:
     return points
 
 
-def knn_graph(points: Float, num_neighbors: int) -> csr_array:
+def knn_graph(points: Float, num_neighbors: int, within_m: float = np.inf) -> csr_array:
     """Return the weights W of the undirected graph of nearest neighbours.
 
     W is (n,n) symmetric float64, with ``W[i, j] = exp(-|p_i - p_j|² / 1 m²)`` where either point is
@@ -48,6 +48,7 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
         points: (n,3) metres.
         num_neighbors: k, itself excluded. At most n - 1 are used. A larger k couples the flow of
             points farther apart.
+        within_m: Greatest distance of a neighbour.
 
     Raises:
         InputError: k is below 1, or the points are no cloud, see `checked_cloud`.
@@ -57,11 +58,13 @@ def knn_graph(points: Float, num_neighbors: int) -> csr_array:
     points = checked_cloud(points, "points")
     num = len(points)
     num_nearest = min(num_neighbors, num - 1) + 1  # with the point itself
-    distance_m, neighbour = cKDTree(points).query(points, np.arange(1, num_nearest + 1))
+    distance_m, neighbour = cKDTree(points).query(
+        points, np.arange(1, num_nearest + 1), distance_upper_bound=within_m
+    )
     row = np.repeat(np.arange(num), num_nearest)
-    column = np.ravel(neighbour)
+    column = np.ravel(neighbour)  # n for a neighbour that is too far away
     # With more than k duplicates, the point itself may be missing among the nearest.
-    is_edge = column != row
+    is_edge = (column != row) & (column < num)
     weight = np.exp(-(np.ravel(distance_m)[is_edge] ** 2))
     directed = csr_array((weight, (row[is_edge], column[is_edge])), shape=(num, num))
     weights = csr_array(directed.maximum(directed.T) + eye_array(num))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,33 +30,10 @@ from densify.geometry import poses
 from densify.geometry.nearest import link
 from densify.geometry.types import Float, FlowField, Motion
 
-SOLVERS = ("pcg", "adam")
-_LEARNING_RATE_M = 0.1  # of Adam, as published
+_ADAM_STEPS = 1500  # 200 usually reach the lowest energy
 _FIRST_ALPHA = 1000.0  # whole surfaces move together at this alpha
-_LEVEL_FACTOR = 10 ** (2 / 3)  # greatest factor between the alphas of two levels
-_LEAST_ALPHA = 0.1  # last level for alpha = 0
 _LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers the energy by less (share)
 _MAX_ALTERNATIONS, _MAX_LAST_ALTERNATIONS = 4, 100  # per level before the last, on the last
-_MAX_PRODUCTS, _RESIDUAL_DROP = 20, 0.2  # matches are provisional: no full solution is needed
-
-
-@dataclass(frozen=True)
-class SolverSettings:
-    """The settings of a solver. The defaults are the paper's except for the solver."""
-
-    solver: str = "pcg"  # or "adam"
-    alpha: float = 10.0  # weight of smoothness, at least 0; larger: neighbours move more alike
-    num_neighbors: int = 50  # k of the graph; a larger k is stiffer and slower
-    adam_num_steps: int = 1500  # 200 usually reach the lowest energy
-
-    def __post_init__(self) -> None:
-        if self.solver not in SOLVERS:
-            raise InputError(f"solver: got {self.solver!r}, expected one of {', '.join(SOLVERS)}")
-        if not 0 <= self.alpha < math.inf:
-            raise InputError(f"alpha: got {self.alpha}, expected a finite number, at least 0")
-        for name in ("num_neighbors", "adam_num_steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: got {getattr(self, name)}, expected at least 1")
 
 
 @dataclass(frozen=True)
@@ -74,7 +52,7 @@ class Solution:
 def solve(
     source: ArrayLike,
     target: ArrayLike,
-    settings: SolverSettings | None = None,
+    settings: ObjectiveSettings | None = None,
     initial: ArrayLike | None = None,
 ) -> Solution:
     """Return the smooth flow that moves ``source`` onto ``target``, a local minimum.
@@ -84,14 +62,14 @@ def solve(
     Args:
         source: (n,3) metres.
         target: (m,3) metres, in the same frame.
-        settings: Solver and its numbers; None for the defaults of `SolverSettings`.
+        settings: Solver, weight and graph of the objective; None for the defaults.
         initial: (n,3) flow in metres to start from, None for 0. With it, pcg uses the final alpha
             at once.
 
     Raises:
         InputError: A shape does not fit, or a cloud is empty or not finite.
     """
-    settings = settings or SolverSettings()
+    settings = settings or ObjectiveSettings()
     points = checked_cloud(source, "source")
     target_points = checked_cloud(target, "target")
     start = np.zeros_like(points) if initial is None else checked_cloud(initial, "initial")
@@ -102,14 +80,14 @@ def solve(
     origin = points.mean(axis=0)
     points, target_points = points - origin, target_points - origin
     if settings.solver == "adam":
-        return _solve_by_adam(points, target_points, L, start, settings)
-    problem = _Problem(points, target_points, L, settings.alpha)
+        return _solve_by_adam(points, target_points, L, start, settings.alpha)
+    problem = _Problem(points, target_points, cKDTree(target_points), L, settings.alpha)
     first_alpha = settings.alpha if initial is not None else _FIRST_ALPHA
     return _solve_by_pcg(problem, start, _descending_alphas(first_alpha, settings.alpha))
 
 
 def _solve_by_adam(
-    source: Float, target: Float, L: csr_array, start: Float, settings: SolverSettings
+    source: Float, target: Float, L: csr_array, start: Float, alpha: float
 ) -> Solution:
     """Return the solution by Adam, the published protocol, keeping the best flow of all steps."""
     import torch
@@ -120,15 +98,15 @@ def _solve_by_adam(
         flow = torch.from_numpy(start).requires_grad_()
         points = torch.from_numpy(source)
         target_points = torch.from_numpy(target)
-        optimizer = torch.optim.Adam([flow], lr=_LEARNING_RATE_M)
-        value = energy(flow, points, target_points, L, settings.alpha)
+        optimizer = torch.optim.Adam([flow], lr=0.1)  # metres, as published
+        value = energy(flow, points, target_points, L, alpha)
         best_flow, best = flow.detach().clone(), value
         energies = [value.total.item()]
-        for _ in range(settings.adam_num_steps):
+        for _ in range(_ADAM_STEPS):
             optimizer.zero_grad()
             value.total.backward()
             optimizer.step()
-            value = energy(flow, points, target_points, L, settings.alpha)
+            value = energy(flow, points, target_points, L, alpha)
             if value.total.item() < best.total.item():
                 best_flow, best = flow.detach().clone(), value
             energies.append(value.total.item())
@@ -147,7 +125,7 @@ class _Value:
         self.data = float(np.sum(forward_m**2) + np.sum(backward_m**2))  # E_d, m²
         self.laplacian_flow = problem.laplacian @ flow  # (n,3) L F
         self.smoothness = float((flow * self.laplacian_flow).sum())  # tr(FᵀLF), m²
-        self.total = self.data + problem.alpha * self.smoothness
+        self.total = self.at(problem.alpha)
         # (n,3) sums of the vectors from each moved point to its matches, in both directions. They
         # are minus half the gradient of E_d.
         offset = problem.target - moved[to_source]
@@ -161,16 +139,14 @@ class _Value:
         return self.data + alpha * self.smoothness
 
 
-class _Problem:
+class _Problem(NamedTuple):
     """A pair of clouds relative to the mean of the source, with the Laplacian and alpha."""
 
-    def __init__(self, source: Float, target: Float, L: csr_array, alpha: float) -> None:
-        self.source = source
-        self.target = target
-        self.target_tree = cKDTree(target)
-        self.laplacian = L
-        self.alpha = alpha
-        self.diagonal = L.diagonal()
+    source: Float
+    target: Float
+    target_tree: cKDTree
+    laplacian: csr_array
+    alpha: float
 
 
 def _solve_by_pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
@@ -197,7 +173,7 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
     # (diag(num_matches) + alpha L) X = -gradient / 2, with a Jacobi preconditioner
     shape = problem.source.shape
     diagonal = value.num_matches[:, None]
-    inverse = 1.0 / (diagonal + alpha * problem.diagonal[:, None])
+    inverse = 1.0 / (diagonal + alpha * problem.laplacian.diagonal()[:, None])
 
     def multiply(vector: Float) -> Float:
         flow = vector.reshape(shape)
@@ -211,8 +187,8 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
     step, _ = cg(
         LinearOperator(size, multiply),
         (value.pull - alpha * value.laplacian_flow).ravel(),
-        rtol=_RESIDUAL_DROP,
-        maxiter=_MAX_PRODUCTS,
+        rtol=0.2,  # matches are provisional: no full solution is needed
+        maxiter=20,
         M=LinearOperator(size, precondition),
     )
     return step.reshape(shape)
@@ -220,11 +196,11 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
 
 def _descending_alphas(first: float, alpha: float) -> list[float]:
     """Return alphas from ``first`` down to ``alpha``, in equal factors of at most 10^(2/3)."""
-    lowest_alpha = max(alpha, _LEAST_ALPHA)
+    lowest_alpha = max(alpha, 0.1)  # the last level before alpha = 0
     if first <= lowest_alpha:
         return [alpha]
     # Without the 1e-9, rounding could add a step where the number is an integer.
-    num_steps = math.ceil(math.log(first / lowest_alpha) / math.log(_LEVEL_FACTOR) - 1e-9)
+    num_steps = math.ceil(math.log(first / lowest_alpha) / math.log(10 ** (2 / 3)) - 1e-9)
     return [*np.geomspace(first, lowest_alpha, num_steps + 1)[:-1].tolist(), alpha]
 
 
@@ -232,25 +208,20 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     """Return the motion by the published objective, above the ground; ``argument`` is not used."""
 
     def step(i: int, j: int) -> FlowField:
-        return _sweep_flow(scene, i, j, settings)
+        source, target = scene.stretch.sweeps[i], scene.stretch.sweeps[j]
+        points = poses.transform(source.T_world_lidar, source.sweep.points)
+        target_points = poses.transform(target.T_world_lidar, target.sweep.points)
+        above = scene.ground.above(points) >= ABOVE_GROUND_M
+        target_above = scene.ground.above(target_points) >= ABOVE_GROUND_M
+        field = FlowField.zero(len(above))  # 0 on the ground
+        if above.any() and target_above.any():
+            pair = flow_between(points[above], target_points[target_above], settings.objective)
+            # From the world to the axes of the source's lidar
+            field.displacement[above] = pair.displacement @ source.T_world_lidar[:3, :3]
+            field.moving[above] = pair.moving
+        return field
 
     return ChainedMotion(scene.stretch, step)
-
-
-def _sweep_flow(scene: Scene, i: int, j: int, settings: Config) -> FlowField:
-    """Return the flow of sweep index ``i`` to ``j``, in its lidar frame; 0 on the ground."""
-    source, target = scene.stretch.sweeps[i], scene.stretch.sweeps[j]
-    points = poses.transform(source.T_world_lidar, source.sweep.points)
-    target_points = poses.transform(target.T_world_lidar, target.sweep.points)
-    above = scene.ground.above(points) >= ABOVE_GROUND_M
-    target_above = scene.ground.above(target_points) >= ABOVE_GROUND_M
-    field = FlowField.zero(len(above))
-    if above.any() and target_above.any():
-        pair = flow_between(points[above], target_points[target_above], settings.objective)
-        # From the world to the axes of the source's lidar
-        field.displacement[above] = pair.displacement @ source.T_world_lidar[:3, :3]
-        field.moving[above] = pair.moving
-    return field
 
 
 def flow_between(
@@ -271,21 +242,15 @@ def flow_between(
     Raises:
         InputError: A setting or a shape does not fit, or a cloud is empty or not finite.
     """
-    objective = SolverSettings(
-        solver=settings.solver,
-        alpha=settings.alpha,
-        num_neighbors=settings.num_neighbors,
-    )
-    flow = solve(source, target, objective, initial).flow
+    flow = solve(source, target, settings, initial).flow
     if settings.static_prior:
-        return _keep_moving_groups((np.asarray(source, float), np.asarray(target, float)), flow)
+        return _keep_moving_groups(np.asarray(source, float), np.asarray(target, float), flow)
     static = FlowField.zero(len(flow))
     return replace(static, displacement=flow, moving=np.ones(len(flow), bool))
 
 
-def _keep_moving_groups(clouds: tuple[Float, Float], flow: Float) -> FlowField:
+def _keep_moving_groups(source_points: Float, target_points: Float, flow: Float) -> FlowField:
     """Keep the flow (N,3) of groups of points that certainly move; other points get flow 0."""
-    source_points, target_points = clouds
     # The objective knows no firing times. All points of the source count as measured before the
     # motion (share 0 of it), all points of the target after it (share 1).
     source = PairCloud(source_points, share=np.zeros(len(source_points)))
@@ -293,7 +258,6 @@ def _keep_moving_groups(clouds: tuple[Float, Float], flow: Float) -> FlowField:
     field = FlowField.zero(len(flow))
     long_flow = np.flatnonzero(np.linalg.norm(flow, axis=1) > MIN_MOTION_M)
     num_groups, group = link(source_points[long_flow], LINK_M)
-    num_moving = 0
     for k in range(num_groups):
         members = long_flow[group == k]
         # A group is judged by its common translation: the flow of single points always brings them
@@ -303,6 +267,5 @@ def _keep_moving_groups(clouds: tuple[Float, Float], flow: Float) -> FlowField:
         if judge(k, members, motion, source, target).moves():
             field.displacement[members] = flow[members]
             field.moving[members] = True
-            field.instance[members] = num_moving
-            num_moving += 1
+            field.instance[members] = field.instance.max() + 1
     return field

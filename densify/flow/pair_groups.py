@@ -33,11 +33,8 @@ from densify.free_space.ground import HeightMap
 from densify.geometry.nearest import is_near, link, thinned, tree_of
 from densify.geometry.types import Bool, Float, Float32, Int
 
-SURFACE_M = 1.0
-"""Greatest distance of a neighbour that spans the surface at a position."""
-MISSING = 3.0
-"""Cost of a point without surface, and greatest cost."""
-_MIN_NEIGHBORS = 3
+_SURFACE_M = 1.0  # greatest distance of a neighbour that spans the surface at a position
+MISSING = 3.0  # cost of a point without surface, and greatest cost
 _NOISE_M = 0.1  # noise of a point and of level ground; a closer point is a counterpart
 _THINNING_M = 0.15  # voxel in which one point is kept, because points are denser along rings
 
@@ -47,8 +44,8 @@ class PairCloud:
     """The N points of a cloud above the ground."""
 
     points: Float  # (N,3) metres
-    # (N,) share of the motion at the firing time: 0 at the source's reference time, 1 at the
-    # target's
+    # (N,) share of the motion at the firing time: 0 at the reference time of the source, 1 at that
+    # of the target
     share: Float
 
     @cached_property
@@ -64,79 +61,66 @@ class PairCloud:
         return is_kept
 
     def thin(self, rows: Int) -> Int:
-        """Return those of the given rows that are kept, at most one in each voxel of 0.15 m."""
+        """Return those of the given rows that are kept, at most one in each voxel."""
         return rows[self._is_kept[rows]]
 
     def rows_around(self, points: Float) -> Int:
-        """Return the thinned rows in the box around points (K,3), or within `SURFACE_M` of it."""
+        """Return the thinned rows in the box around points (K,3), or within 1 m of it."""
         if not len(points):
             return np.zeros(0, np.int64)
-        low, high = points.min(axis=0) - SURFACE_M, points.max(axis=0) + SURFACE_M
+        low, high = points.min(axis=0) - _SURFACE_M, points.max(axis=0) + _SURFACE_M
         return self.thin(self.strips.rows_inside(low, high))
 
 
-class Surface:
-    """Surfaces spanned by the points of a cloud, to which other points have a distance."""
+def surface_cost(surface: Float, points: Float) -> Float:
+    """Return (N,) costs of points (N,3), 0 to 3: half their squared Mahalanobis distances.
 
-    def __init__(self, points: Float) -> None:
-        """Index the points (M,3, metres) that span the surfaces."""
-        self._points, self._tree = points, tree_of(points)
-
-    def cost(self, points: Float) -> Float:
-        """Return (N,) costs of points (N,3), 0 to 3: half their squared Mahalanobis distances."""
-        cost = np.full(len(points), MISSING)
-        num = min(NUM_NEAR, self._tree.n)
-        if num < _MIN_NEIGHBORS:
-            return cost
-        ranks = np.arange(1, num + 1)
-        distance_m, neighbour = self._tree.query(points, ranks, distance_upper_bound=SURFACE_M)
-        exists = np.isfinite(distance_m)
-        on_surface = np.flatnonzero(exists.sum(axis=1) >= _MIN_NEIGHBORS)
-        exists = exists[on_surface]
-        neighbour = np.where(exists, np.asarray(neighbour)[on_surface], 0)
-        # Normal distribution of the neighbours that exist; others have weight 0
-        weight = exists / exists.sum(axis=1, keepdims=True)
-        arms = self._points[neighbour]
-        mean = np.einsum("nk,nki->ni", weight, arms)
-        arms -= mean[:, None]
-        covariance = arms.transpose(0, 2, 1) @ (weight[..., None] * arms) + _NOISE_M**2 * np.eye(3)
-        offset = points[on_surface] - mean
-        scaled_offset = np.linalg.solve(covariance, offset[..., None])[..., 0]
-        squared = np.einsum("ni,ni->n", offset, scaled_offset)
-        cost[on_surface] = np.minimum(squared / 2, MISSING)
+    They are distances to the surfaces that the points ``surface`` (M,3) span.
+    """
+    cost = np.full(len(points), MISSING)
+    if len(surface) < 3:
         return cost
+    ranks = np.arange(1, min(NUM_NEAR, len(surface)) + 1)
+    distance_m, neighbour = tree_of(surface).query(points, ranks, distance_upper_bound=_SURFACE_M)
+    exists = np.isfinite(distance_m)
+    on_surface = np.flatnonzero(exists.sum(axis=1) >= 3)
+    exists = exists[on_surface]
+    neighbour = np.where(exists, np.asarray(neighbour)[on_surface], 0)
+    # Normal distribution of the neighbours that exist; others have weight 0
+    weight = exists / exists.sum(axis=1, keepdims=True)
+    arms = surface[neighbour]
+    mean = np.einsum("nk,nki->ni", weight, arms)
+    arms -= mean[:, None]
+    covariance = arms.transpose(0, 2, 1) @ (weight[..., None] * arms) + _NOISE_M**2 * np.eye(3)
+    offset = points[on_surface] - mean
+    scaled_offset = np.linalg.solve(covariance, offset[..., None])[..., 0]
+    squared = np.einsum("ni,ni->n", offset, scaled_offset)
+    cost[on_surface] = np.minimum(squared / 2, MISSING)
+    return cost
 
 
-_MAX_EXTENT_M = 20.0  # horizontal diagonal of the longest vehicle
-_MAX_LOW_M, _MAX_HIGH_M = 3.4, 6.0  # greatest heights of a group's lowest and highest points
-
-
-def find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
+def _find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
     """Return (N,) True for points without a counterpart: no other surface or point in 0.1 m."""
     unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _NOISE_M))
-    surface = Surface(other_cloud.points[other_cloud.thin(np.arange(len(other_cloud.points)))])
+    surface = other_cloud.points[other_cloud.thin(np.arange(len(other_cloud.points)))]
     unexplained = np.zeros(len(cloud.points), bool)
     # A cost of 1.5 is a distance of 1.7 standard deviations from the surface.
-    unexplained[unmatched] = surface.cost(cloud.points[unmatched]) > MISSING / 2
+    unexplained[unmatched] = surface_cost(surface, cloud.points[unmatched]) > MISSING / 2
     return unexplained
 
 
-def group_around(points: Float, unexplained: Bool) -> Int:
+def _group_around(points: Float, unexplained: Bool) -> Int:
     """Return (N,) labels of the groups of points that may be moving, -1 for none.
 
     Points linked by steps of up to 0.6 m form one group if it is no longer than a vehicle, 20 m. In
-    longer groups, such as walls, only points close to unexplained points form groups.
-
-    Args:
-        points: (N,3) metres.
-        unexplained: (N,) True for points without a counterpart in the other cloud.
+    longer groups, such as walls, only points close to ``unexplained`` points form groups.
     """
     num_groups, group = link(points, LINK_M)
     low = np.full((num_groups, 2), np.inf)
     np.minimum.at(low, group, points[:, :2])
     high = np.full((num_groups, 2), -np.inf)
     np.maximum.at(high, group, points[:, :2])
-    is_vehicle_sized = np.linalg.norm(high - low, axis=1) <= _MAX_EXTENT_M
+    is_vehicle_sized = np.linalg.norm(high - low, axis=1) <= 20.0  # diagonal
     long_rows = np.flatnonzero(~is_vehicle_sized[group])
     _, cluster = cluster_around(points[long_rows], unexplained[long_rows])
     # No group has a label of num_groups or more.
@@ -145,16 +129,11 @@ def group_around(points: Float, unexplained: Bool) -> Int:
     return label
 
 
-def find_road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
+def _find_road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[Int]:
     """Return the ascending rows of each group that may be a road user, not a treetop or a wall.
 
     Such a group has at least 8 points, 5 of them unexplained. Its lowest points (5th percentile)
-    are at most 3.4 m high, its highest points (95th percentile) at most 6 m.
-
-    Args:
-        group: (N,) label of each point's group, -1 for none.
-        unexplained: (N,) True for points without a counterpart in the other cloud.
-        height_m: (N,) height of the points above the ground.
+    are at most 3.4 m above the ground, its highest points (95th percentile) at most 6 m.
     """
     rows = np.flatnonzero(group >= 0)
     rows = rows[np.argsort(group[rows], kind="stable")]
@@ -164,29 +143,18 @@ def find_road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[In
         if len(members) >= MIN_POINTS and unexplained[members].sum() >= MIN_FIT:
             # Percentiles, because single points may be of something else
             low_m, high_m = np.percentile(height_m[members], (5, 95))
-            if low_m <= _MAX_LOW_M and high_m <= _MAX_HIGH_M:
+            if low_m <= 3.4 and high_m <= 6.0:
                 users.append(members)
     return users
 
 
 # Time between the clouds: assumed if unknown, and the longest that is searched
 _USUAL_S, _LONGEST_S = 0.1, 0.4
-MIN_MOTION_M = 0.1  # a shorter motion, or difference of two, may be an error of registration
-_NUM_VOTED, _APART_M = 5, 0.5  # displacements from the vote, and their least distance
-_PER_M = 1e-3  # loss of the vote per metre: of displacements with equal score the shortest wins
-_REFINE_M = (0.08, 0.04, 0.02)  # steps of the refinement
-_YAW_PER_M = 0.25  # rad: 4 m from the centre, a point moves by the same step
-_START_M = 1.0  # standard deviation of a voted displacement: it hardly constrains the alignment
+MIN_MOTION_M = _NOISE_M  # a shorter motion, or difference, may be an error of registration
+_APART_M = 0.5  # least distance between displacements from the vote
 _MIN_GAIN = 10.0  # least log-likelihood ratio in each cloud: thousands of motions are tried
-# Least gain of the target points, relative to that of the source points: both show the same object.
-_MIN_TARGET_SHARE = 0.25
 _MAX_MISFIT = 1.7  # greatest mean cost of the moved points
-# Greatest thickness (RMS) of a wall, and greatest share of the motion across it
-_WALL_M, _WALL_ACROSS = 0.05, 0.3
-# Greatest width (RMS) of a rail, its greatest rise, and least share of the motion along it
-_RAIL_M, _RAIL_RISE, _RAIL_ALONG = 0.12, 0.5, 0.2
-_MAX_BACK_M, _MAX_BACK_POINTS = 0.75, 60  # length (RMS) and points of a far car's back
-_SLOPE_STEP_M, _SLOPE_STEPS = 2.0, 4  # the grid that is fitted around a position
+_WALL_M, _RAIL_M = 0.05, 0.12  # greatest thickness of a wall, and width of a rail (RMS)
 
 
 @dataclass(frozen=True)
@@ -216,15 +184,14 @@ class Proposal:
     group: int  # index of the group
     motion: RigidMotion  # motion of the group
     source_gain: float  # log-likelihood ratio of the source points, moved against static
-    misfit: float  # mean cost of the moved points (see `Surface.cost`)
+    misfit: float  # mean `surface_cost` of the moved points
     rows: Int  # (K,) indices of the target points near the group, moved or static
     target_gain: Float  # (K,) log-likelihood ratios of these points
 
     @property
     def gain(self) -> float:
         """The log-likelihood ratio of both clouds, without target points that fit static better."""
-        # An object shows other parts after it has moved. Target points on these parts fit static
-        # better, and would bias the motion.
+        # Target points on parts that the object showed only later would bias the motion.
         return self.source_gain + float(np.maximum(self.target_gain, 0.0).sum())
 
     def moves_like(self, other_proposal: Proposal) -> bool:
@@ -236,14 +203,14 @@ class Proposal:
     def moves(self, free: Bool | None = None) -> bool:
         """Return True if the group certainly moves.
 
-        Args:
-            free: (K,) True for target points that no other motion explains. None for all.
+        Of target points that another motion explains, ``free`` (K,) False, only evidence against
+        the motion counts.
         """
         counted_gain = self.target_gain
         if free is not None:
-            # Evidence against the motion always counts, also from points of another motion.
             counted_gain = self.target_gain[free | (self.target_gain < 0)]
-        min_gain = max(_MIN_GAIN, _MIN_TARGET_SHARE * self.source_gain)
+        # Both clouds show the same object: the target's gain is a quarter of the source's at least.
+        min_gain = max(_MIN_GAIN, self.source_gain / 4)
         is_explained = self.source_gain > _MIN_GAIN and counted_gain.sum() > min_gain
         return bool(is_explained and self.misfit < _MAX_MISFIT)
 
@@ -251,15 +218,10 @@ class Proposal:
 def judge(
     group: int, members: Int, motion: RigidMotion, source: PairCloud, target: PairCloud
 ) -> Proposal:
-    """Return a motion of one group as a proposal, with the evidence that the group moves.
+    """Return a motion of one group, source points at rows ``members``, with the evidence for it.
 
     Source points are compared with the target. Target points are compared with the source, in which
     only the group moves: points that stay at its old position count against the motion.
-
-    Args:
-        group: Index of the group, which the proposal keeps.
-        members: (K,) rows of the group's source points, K >= 1.
-        motion: Motion of the group that is judged.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.thin(members)
@@ -270,14 +232,14 @@ def judge(
     # If the group moves, a target point lies on the moved group or on the rest of the source.
     source_rows = source.rows_around(points)
     rest = np.setdiff1d(source_rows, members, assume_unique=True)
-    group_cost = Surface(motion.at_start(source, members)).cost(motion.at_start(target, rows))
-    target_moved_cost = np.minimum(group_cost, Surface(source.points[rest]).cost(points))
-    target_static_cost = Surface(source.points[source_rows]).cost(points)
+    group_cost = surface_cost(motion.at_start(source, members), motion.at_start(target, rows))
+    target_moved_cost = np.minimum(group_cost, surface_cost(source.points[rest], points))
+    target_static_cost = surface_cost(source.points[source_rows], points)
     return Proposal(
         group=group,
         motion=motion,
         source_gain=float((static_cost - moved_cost).sum()),
-        misfit=float(moved_cost.mean()),
+        misfit=float(moved_cost.sum()) / max(len(moved_cost), 1),
         rows=rows,
         target_gain=target_static_cost - target_moved_cost,
     )
@@ -286,18 +248,14 @@ def judge(
 def cost_on_target(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Return how badly source points fit the surfaces of the target under a motion.
+    """Return how badly source points ``members`` (K,) fit the target's surfaces under a motion.
 
     Both clouds are moved back to the source's reference time, each point from its own share of the
     motion.
 
-    Args:
-        members: (K,) rows of the compared source points, K >= 1.
-
     Returns:
-        cost: (K,) costs of the source points, 0 to 3, see `Surface.cost`.
-        rows: Indices of the thinned target points that, moved back, are in the box around the
-            source points or within 1 m of it.
+        The (K,) costs (`surface_cost`), and the rows of the thinned target points that, moved back,
+        are in the box around the source points or within 1 m of it.
     """
     members_at_start = motion.at_start(source, members)
     # Target points are measured over some time. Only those can fit that lie around the group at the
@@ -306,12 +264,12 @@ def cost_on_target(
     positions = [motion.place(members_at_start, share) for share in ends]
     rows = target.rows_around(np.concatenate(positions))
     target_at_start = motion.at_start(target, rows)
-    is_close = _in_box(target_at_start, members_at_start, SURFACE_M)
-    return Surface(target_at_start[is_close]).cost(members_at_start), rows[is_close]
+    is_close = _in_box(target_at_start, members_at_start, _SURFACE_M)
+    return surface_cost(target_at_start[is_close], members_at_start), rows[is_close]
 
 
 @dataclass(frozen=True)
-class Search:
+class _Search:
     """Search for the motions of groups of source points; see `find_movers` for the arguments."""
 
     source: PairCloud  # points above the ground
@@ -323,13 +281,9 @@ class Search:
     initial: Float | None
 
     def proposals(self, group: int, members: Int) -> list[Proposal]:
-        """Return the motions that both clouds clearly support for a group, with their evidence.
+        """Return the motions that both clouds clearly support for a group of source points.
 
-        Motions below 0.1 m or along a wall or a rail are left out. The list may be empty.
-
-        Args:
-            group: Index of the group.
-            members: (K,) rows of the group's source points.
+        Motions below 0.1 m or along a wall or a rail are left out.
         """
         points = self.source.points[members]
         centre = points.mean(axis=0)
@@ -347,8 +301,13 @@ class Search:
             return []
         slope = _slope_of(self.ground, centre)
         displacements += self._vote(members, rows, slope, reach_m)
-        judged = list[Proposal]()
-        for state in self._align_all(displacements, centre, members, rows):
+        states, judged = list[Float](), list[Proposal]()
+        for displacement in displacements:
+            start = RigidMotion(np.append(displacement, 0.0), centre)
+            state = self._align(start, members, rows)
+            if state is None or any(_are_alike(state, earlier) for earlier in states):
+                continue
+            states.append(state)
             state[2] = state[:2] @ slope  # rise in z: the group stays on the ground
             moved_m = np.linalg.norm(state[:2])
             if MIN_MOTION_M < moved_m <= limit_m and not _is_ambiguous(points, state[:3]):
@@ -361,23 +320,20 @@ class Search:
 
         Alignment is biased towards positions at which scan lines match scan lines. The likelihood
         is not. Pattern search: Hooke, Jeeves, JACM 1961.
-
-        Args:
-            proposal: Motion of the group to start from.
-            members: (K,) rows of the group's source points.
         """
         slope = _slope_of(self.ground, proposal.motion.centre)
-        # Steps (x, y, z, yaw): along the motion, across the motion, and about the vertical
+        # Steps (x, y, z, yaw): along the motion, across the motion, and about the vertical, where a
+        # point 4 m from the centre moves by the same step
         x, y = proposal.motion.state[:2] / np.linalg.norm(proposal.motion.state[:2])
-        axes = np.array([[x, y, 0, 0], [-y, x, 0, 0], [0, 0, 0, _YAW_PER_M]])
-        for step_m in _REFINE_M:
+        axes = np.array([[x, y, 0, 0], [-y, x, 0, 0], [0, 0, 0, 1 / 4]])
+        for step_m in (0.08, 0.04, 0.02):
             # Steps are taken as long as one of them raises the gain.
             previous = None
             while previous is not proposal:
                 previous = proposal
                 for axis in (*axes, *-axes):
                     state = proposal.motion.state + step_m * axis
-                    state[2] = state[:2] @ slope  # rise in z, along the ground
+                    state[2] = state[:2] @ slope
                     motion = replace(proposal.motion, state=state)
                     trial = judge(proposal.group, members, motion, self.source, self.target)
                     proposal = max(proposal, trial, key=lambda candidate: candidate.gain)
@@ -395,25 +351,14 @@ class Search:
         displacements = np.column_stack([displacements, displacements @ slope])
         nearness = np.zeros((len(displacements), len(group.points)), np.uint8)
         field.raise_nearness(nearness, group, displacements)
-        score = nearness.mean(axis=1) / 255 - _PER_M * np.linalg.norm(displacements, axis=1)
+        # Of displacements with equal score the shortest wins.
+        score = nearness.mean(axis=1) / 255 - 1e-3 * np.linalg.norm(displacements, axis=1)
         # The best displacement, then the best of those at least 0.5 m away from it, and so on
         voted = []
-        for _ in range(_NUM_VOTED):
+        for _ in range(5):
             voted.append(displacements[np.argmax(score)])
             score[np.linalg.norm(displacements - voted[-1], axis=1) < _APART_M] = -1.0
         return voted
-
-    def _align_all(
-        self, displacements: list[Float], centre: Float, members: Int, rows: Int
-    ) -> list[Float]:
-        """Return the different states (4,) to which a group is aligned from the displacements."""
-        states = list[Float]()
-        for displacement in displacements:
-            start = RigidMotion(np.append(displacement, 0.0), centre)
-            state = self._align(start, members, rows)
-            if state is not None and not any(_are_alike(state, earlier) for earlier in states):
-                states.append(state)
-        return states
 
     def _align(self, start: RigidMotion, members: Int, rows: Int) -> Float | None:
         """Return the state (4,) that aligns members with target rows, None for too few matches."""
@@ -423,7 +368,8 @@ class Search:
         arrived = start.place(target_points[is_close], 1.0)
         if len(arrived) < MIN_FIT:
             return None
-        std = np.append([_START_M, _START_M], PREDICTION_STD[2])
+        # Standard deviations of 1 m, so that the vote hardly constrains the alignment
+        std = np.append([1.0, 1.0], PREDICTION_STD[2])
         return model.align(arrived, start.centre, start.state, std)
 
 
@@ -443,7 +389,7 @@ def _in_box(points: Float, inner: Float, slack_m: float) -> Bool:
 
 def _slope_of(ground: HeightMap, position: Float) -> Float:
     """Return the slope (2,) of the ground around a position (3,), 0 where it is not plane."""
-    steps = np.arange(-_SLOPE_STEPS, _SLOPE_STEPS + 1) * _SLOPE_STEP_M
+    steps = np.arange(-8.0, 9.0, 2.0)
     offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     height_m = ground.under(position[:2] + offset)
     # Least squares: the grid is symmetric, hence both axes are independent.
@@ -459,17 +405,14 @@ def _is_ambiguous(points: Float, displacement: Float) -> bool:
     _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     length_m, width_m, thickness_m = scale / np.sqrt(len(points))  # RMS along the three axes
     moved_m = np.linalg.norm(displacement)
-    if width_m < _RAIL_M and abs(axes[0, 2]) < _RAIL_RISE:
-        # Any motion may lead to another part of a rail. The back of a far car looks alike, but is
-        # ambiguous only along itself.
-        is_far_car = len(points) < _MAX_BACK_POINTS and length_m < _MAX_BACK_M
-        return bool(not is_far_car or abs(axes[0] @ displacement) > _RAIL_ALONG * moved_m)
+    if width_m < _RAIL_M and abs(axes[0, 2]) < 0.5:  # level
+        # Any motion may lead to another part of a rail. The back of a far car, narrow and of few
+        # points, looks alike, but is ambiguous only along itself.
+        is_far_car = len(points) < 60 and length_m < 0.75
+        return bool(not is_far_car or abs(axes[0] @ displacement) > 0.2 * moved_m)
     # Along a wall the motion may lead to another part of it. For points on a line any motion may.
-    is_along_wall = abs(axes[-1] @ displacement) < _WALL_ACROSS * moved_m
+    is_along_wall = abs(axes[-1] @ displacement) < 0.3 * moved_m
     return bool(thickness_m < _WALL_M and (is_along_wall or width_m < _WALL_M))
-
-
-_BESIDE_M = 5.0  # groups closer than this may be parts of one object
 
 
 def find_movers(
@@ -480,7 +423,7 @@ def find_movers(
     apart_s: float | None = None,
     initial: Float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions of the moving groups, and the group of each source point.
+    """Return the motions of the moving groups, and (N,) the motion of each source point, or -1.
 
     Args:
         source: N points above the ground.
@@ -491,18 +434,15 @@ def find_movers(
             speeds up to 38 m/s over at most 0.4 s.
         initial: (N,3) flow in metres, or None. The search of a group also starts at the median flow
             of its members.
-
-    Returns:
-        The motions, and (N,) the index of each source point's motion, -1 for static points.
     """
     # Proposals of all groups, then the best consistent ones, refined
     clouds = source, target
     with ThreadPoolExecutor(2) as pool:
-        unexplained = list(pool.map(find_unexplained, clouds, clouds[::-1]))
+        unexplained = list(pool.map(_find_unexplained, clouds, clouds[::-1]))
         points = [cloud.points for cloud in clouds]
-        group, target_group = pool.map(group_around, points, unexplained)
-        members = find_road_users(group, unexplained[0], height_m)
-        search = Search(source, target, target_group >= 0, ground, apart_s, initial)
+        group, target_group = pool.map(_group_around, points, unexplained)
+        members = _find_road_users(group, unexplained[0], height_m)
+        search = _Search(source, target, target_group >= 0, ground, apart_s, initial)
         proposals = list(chain(*pool.map(search.proposals, range(len(members)), members)))
         chosen = _select_motions(proposals, len(target.points))
         chosen_members = [members[proposal.group] for proposal in chosen]
@@ -540,7 +480,7 @@ def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
     total = np.zeros(len(proposals))
     for i, proposal in enumerate(proposals):
         gains = dict[int, float]()  # best gain of each group
-        for j in np.flatnonzero(np.linalg.norm(centres - centres[i], axis=1) < _BESIDE_M):
+        for j in np.flatnonzero(np.linalg.norm(centres - centres[i], axis=1) < 5.0):
             neighbour = proposals[j]
             if neighbour.moves_like(proposal):
                 gains[neighbour.group] = max(neighbour.gain, gains.get(neighbour.group, 0.0))
@@ -553,10 +493,10 @@ def _claim_fitting_points(
 ) -> None:
     """Assign static points within 1 m of group k to it, in place, if they fit its motion better."""
     members = source.points[instance == k]
-    low, high = members.min(axis=0) - SURFACE_M, members.max(axis=0) + SURFACE_M
+    low, high = members.min(axis=0) - _SURFACE_M, members.max(axis=0) + _SURFACE_M
     rows = source.strips.rows_inside(low, high)
     rows = rows[instance[rows] < 0]
-    rows = rows[is_near(tree_of(members), source.points[rows], SURFACE_M)]
+    rows = rows[is_near(tree_of(members), source.points[rows], _SURFACE_M)]
     if len(rows):
         static = RigidMotion(np.zeros(4), motion.centre)
         static_cost, _ = cost_on_target(source, rows, target, static)

@@ -14,26 +14,19 @@ from densify.geometry.types import Bool, Float
 
 GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, per round
 # Greatest sum of the matches' weights: errors of neighbours on a surface are correlated.
-MAX_WEIGHT = 60.0
+_MAX_WEIGHT = 60.0
 NUM_NEAR = 12  # neighbours that span a surface
 MIN_FIT = 5  # least number of matches
 _SURFACE_M = 0.05  # noise of a surface point
 _RIDGE = 0.02  # share of the mean variance that is added, for points on a line
 # Points of a model, and points that are aligned: more would be neighbours with the same error
 _MAX_MODEL_POINTS, _NUM_ALIGNED = 1000, 250
-_AXES = np.array([0, 1, 3])  # of a state: x, y and yaw
 # Factor of the covariance: points of a surface must not stop a motion along the surface.
 _LOOSE = 10.0
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
-    """Return the (N,3) points of an object, turned about its centre and displaced.
-
-    Args:
-        state: Displacement x, y, z (m) and yaw (rad): (4,) for all points, or (N,4).
-        points: (N,3) metres.
-        centre: Centre of the rotation: (3,) for all points, or (N,3); in the frame of the points.
-    """
+    """Return (N,3) points, turned about a centre and displaced by a state (4,), or by (N,4)."""
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
@@ -185,8 +178,8 @@ def _align(
                     H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
         if num_matches < MIN_FIT:
             return False
-        # The matches together weigh at most `MAX_WEIGHT` against the prediction.
-        _step(H, g, min(1.0, MAX_WEIGHT / num_matches), predicted, prior, state)
+        # The matches together weigh at most `_MAX_WEIGHT` against the prediction.
+        _step(H, g, min(1.0, _MAX_WEIGHT / num_matches), predicted, prior, state)
     return True
 
 
@@ -198,11 +191,13 @@ def _step(H: Float, g: Float, weight: float, predicted: Float, prior: Float, sta
     for a in range(3):
         for b in range(3):
             H[a, b] *= weight
+        axis = a if a < 2 else 3  # of the state: x, y, yaw
         H[a, a] += prior[a]
-        g[a] = weight * g[a] + prior[a] * (predicted[_AXES[a]] - state[_AXES[a]])
+        g[a] = weight * g[a] + prior[a] * (predicted[axis] - state[axis])
     _invert(H, inverse)
     for a in range(3):
-        state[_AXES[a]] += inverse[a, 0] * g[0] + inverse[a, 1] * g[1] + inverse[a, 2] * g[2]
+        axis = a if a < 2 else 3
+        state[axis] += inverse[a, 0] * g[0] + inverse[a, 1] * g[1] + inverse[a, 2] * g[2]
 
 
 @inlined

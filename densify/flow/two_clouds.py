@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,11 +21,10 @@ from densify.flow.pair_groups import PairCloud, find_movers
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.geometry import poses
 from densify.geometry.nearest import nearest, tree_of
-from densify.geometry.types import Float, FlowField, Int, Motion, Stretch
+from densify.geometry.types import Float, FlowField, Int, Motion, RegisteredSweep
 
 _MAX_EXTENT_M = 400.0  # greatest distance in x and y, from the middle, of searched points
 _MIN_LOW_M = 0.04  # least height of points below a moving group: lower ones are of the road
-_SCANNERS_APART_M = 1000.0  # lifts each scanner's points out of reach of the others'
 _BELOW_M = 0.3  # horizontal distance of points below a moving group
 
 
@@ -76,7 +75,7 @@ def estimate_flow(
             "alone are no recording"
         )
     clouds = checked_cloud(source, "source"), checked_cloud(target, "target")
-    times = _times_as_shares(_columns(source_offset_ns, target_offset_ns, clouds, "offset_ns"))
+    times_ns = _columns(source_offset_ns, target_offset_ns, clouds, "offset_ns")
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
@@ -85,21 +84,13 @@ def estimate_flow(
         raise InputError(
             f"initial: got shape {initial_flow.shape}, expected the source's {clouds[0].shape}"
         )
-    return _flow_of_groups(clouds, initial_flow, times, lidars)
-
-
-class _PointTimes(NamedTuple):
-    """Firing times of two clouds, in units of the time between the clouds."""
-
-    # (N,) and (M,): 0 at the middle of the source's times, 1 at the target's
-    shares: tuple[Float, Float]
-    apart_s: float  # time between the clouds
+    return _flow_of_groups(clouds, initial_flow, times_ns, lidars)
 
 
 def _flow_of_groups(
     clouds: tuple[Float, Float],
     initial: Float | None,
-    times: _PointTimes | None,
+    times_ns: tuple[Int, Int] | None,
     lidars: tuple[Int, Int] | None,
 ) -> FlowField:
     """Return the flow of the groups of the source that certainly move; see `estimate_flow`."""
@@ -121,19 +112,21 @@ def _flow_of_groups(
         return field
 
     # Phase 2: the moving groups
-    if times is not None:
-        source_share, target_share = times.shares
-    else:
-        source_share, target_share = np.zeros(len(clouds[0])), np.ones(len(clouds[1]))
-        if lidars is not None:
-            _separate_scanners(points, lidars)
+    shares, apart_s = _times_as_shares(clouds, times_ns)
+    source_share, target_share = shares
+    if apart_s is None and lidars is not None:
+        # Without times, the points of two scanners cannot be compared: each measures an object at
+        # another time. Lifted by 1 km, they are out of reach of each other.
+        _, scanner = np.unique(np.concatenate(lidars), return_inverse=True)
+        for cloud, number in zip(points, np.split(scanner, [len(points[0])]), strict=True):
+            cloud[:, 2] += 1000.0 * number
     source_points, target_points = points
     motions, instance = find_movers(
         source=PairCloud(source_points[source_rows], source_share[source_rows]),
         target=PairCloud(target_points[target_rows], target_share[target_rows]),
         height_m=heights_m[0][is_obstacle[0]],
         ground=ground,
-        apart_s=None if times is None else times.apart_s,
+        apart_s=apart_s,
         initial=None if initial is None else initial[source_rows],
     )
     field.instance[source_rows] = instance
@@ -149,16 +142,7 @@ def _flow_of_groups(
         field.displacement[rows] = motion.place(at_reference, 1.0) - at_reference
         to_reference[rows] = at_reference - measured
     field.moving[:] = field.instance >= 0
-    return field if times is None else replace(field, to_reference=to_reference)
-
-
-def _separate_scanners(points: list[Float], lidars: tuple[Int, Int]) -> None:
-    """Lift the points of each scanner, in place, out of reach of the other scanners' points."""
-    # Without times, the points of two scanners cannot be compared: each measures an object at
-    # another time.
-    _, scanner = np.unique(np.concatenate(lidars), return_inverse=True)
-    for cloud, number in zip(points, np.split(scanner, [len(points[0])]), strict=True):
-        cloud[:, 2] += _SCANNERS_APART_M * number
+    return field if apart_s is None else replace(field, to_reference=to_reference)
 
 
 def _attach_below(points: Float, field: FlowField, low_rows: Int) -> None:
@@ -192,10 +176,17 @@ def _columns(
     return columns[0], columns[1]
 
 
-def _times_as_shares(times_ns: tuple[Int, Int] | None) -> _PointTimes | None:
-    """Return firing times (N,) and (M,) as shares; None without times, or if all are equal."""
+def _times_as_shares(
+    clouds: tuple[Float, Float], times_ns: tuple[Int, Int] | None
+) -> tuple[tuple[Float, Float], float | None]:
+    """Return firing times (N,) and (M,) as shares of the time between the clouds, and that time.
+
+    Shares are 0 at the middle of the source's times, 1 at the target's. Without times, or if all
+    are equal, the time is None.
+    """
+    unknown = (np.zeros(len(clouds[0])), np.ones(len(clouds[1]))), None
     if times_ns is None:
-        return None
+        return unknown
     first_ns = np.array([int(np.min(cloud_ns)) for cloud_ns in times_ns])
     last_ns = np.array([int(np.max(cloud_ns)) for cloud_ns in times_ns])
     middle_ns = first_ns + (last_ns - first_ns) // 2
@@ -206,10 +197,10 @@ def _times_as_shares(times_ns: tuple[Int, Int] | None) -> _PointTimes | None:
         # target is the next revolution.
         gap_ns = revolution_ns
     if gap_ns == 0:
-        return None
+        return unknown
     source_share = (times_ns[0] - middle_ns[0]) / gap_ns
     target_share = 1 + (times_ns[1] - middle_ns[1]) / gap_ns
-    return _PointTimes((source_share, target_share), abs(gap_ns) * 1e-9)
+    return (source_share, target_share), abs(gap_ns) * 1e-9
 
 
 # --- The engine ``pairs``
@@ -221,14 +212,16 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
     pair_settings = replace(settings, flow=replace(settings.flow, engine="groups"))
 
     def step(i: int, j: int) -> FlowField:
-        return _flow_to_neighbour(scene.stretch, i, j, pair_settings)
+        sweeps = scene.stretch.sweeps
+        return _flow_to_neighbour(sweeps[i], sweeps[j], pair_settings)
 
     return ChainedMotion(scene.stretch, step)
 
 
-def _flow_to_neighbour(stretch: Stretch, i: int, j: int, settings: Config) -> FlowField:
-    """Return the flow of sweep index i to the reference time of sweep index j, lidar frame of i."""
-    source, target = stretch.sweeps[i], stretch.sweeps[j]
+def _flow_to_neighbour(
+    source: RegisteredSweep, target: RegisteredSweep, settings: Config
+) -> FlowField:
+    """Return the flow of a sweep to the reference time of another one, lidar frame of the first."""
     if min(len(source.sweep), len(target.sweep)) == 0:
         return FlowField.zero(len(source.sweep))
     source_ns, target_ns = source.sweep.offset_ns, target.sweep.offset_ns
@@ -247,11 +240,11 @@ def _flow_to_neighbour(stretch: Stretch, i: int, j: int, settings: Config) -> Fl
         source_lidar=source.sweep.lidar if has_scanners else None,
         target_lidar=target.sweep.lidar if has_scanners else None,
     )
-    R_lidar_world = source.T_world_lidar[:3, :3].T
-    displacement = field.displacement @ R_lidar_world.T
+    R_world_lidar = source.T_world_lidar[:3, :3]
+    displacement = field.displacement @ R_world_lidar
     to_reference = None
     if field.to_reference is not None and source_ns is not None:
         # The flow's reference is the middle of the firing times. The stamp may be another time.
         middle_ns = int(source_ns.min()) + np.ptp(source_ns) / 2
-        to_reference = field.to_reference @ R_lidar_world.T - displacement * (middle_ns / apart_ns)
+        to_reference = field.to_reference @ R_world_lidar - displacement * (middle_ns / apart_ns)
     return replace(field, displacement=displacement, to_reference=to_reference)

@@ -33,8 +33,8 @@ from densify.outputs.atomic import write_file
 from densify.outputs.flow_writers import flow_npz
 from densify.pipeline.recording import Recording
 
+# Least speed of a moving box; box poses are not accurate (Chodosh et al., WACV 2024)
 _MOVES_M_S = 0.5
-"""Least speed of a moving box; box poses are not accurate (Chodosh et al., WACV 2024)."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,9 @@ def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: in
     """Return the label of a sweep, None without a next sweep or without boxes of both."""
     stretch = recording.window(frame)
     following = next((other for other in stretch.frames if other > frame), None)
-    if following is None:
-        return None
-    source_boxes, target_boxes = boxes(frame), boxes(following)
-    if source_boxes is None or target_boxes is None:
+    source_boxes = boxes(frame)
+    target_boxes = None if following is None else boxes(following)
+    if following is None or source_boxes is None or target_boxes is None:
         return None
     registered, after = stretch[frame], stretch[following]
     field, sure = flow_of_boxes(registered, after, source_boxes, target_boxes)
@@ -119,12 +118,8 @@ def flow_of_boxes(
 ) -> tuple[FlowField, Bool]:
     """Return the flow of the N points of one sweep to the next, and which flows are certain.
 
-    Args:
-        source: Sweep of the N points.
-        after: Next sweep in the same world. Only its pose and time are used.
-        boxes: Boxes of ``source``.
-        next_boxes: Boxes of ``after``. Boxes of one object share the track name.
-        margins: Margins around the boxes, None for the defaults.
+    Both sweeps have boxes; those of one object share the track name. Only pose and time of the
+    sweep ``after`` are used. ``margins`` is None for the defaults.
 
     Returns:
         The flow with ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row
@@ -174,10 +169,8 @@ def _rows_around(
     """Return the indices of the points that may be in or beside box k."""
     sweep = registered.sweep
     reach_m = np.linalg.norm(boxes.size_m[k] / 2 + margins.grown_m + margins.unsure_m)
-    rows: Int = np.flatnonzero(
-        (np.abs(sweep.points[:, 0] - T_lidar_box[0, 3]) <= reach_m)
-        & (np.abs(sweep.points[:, 1] - T_lidar_box[1, 3]) <= reach_m)
-    )
+    offset_m = np.abs(sweep.points[:, :2] - T_lidar_box[:2, 3])
+    rows: Int = np.flatnonzero((offset_m <= reach_m).all(axis=1))
     if boxes.lidar is not None and boxes.lidar[k] >= 0:  # drawn for one scanner
         rows = rows[sweep.lidar[rows] == boxes.lidar[k]]
     return rows
@@ -187,9 +180,8 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
     """Return the (K,4,4) box poses, lidar frame, deskewed to the reference time like the points."""
     if boxes.offset_ns is None:
         return boxes.T_lidar_box
-    twists = np.stack([registered.twist_before, registered.twist_after])
-    twist: Float = twists[(boxes.offset_ns >= 0).astype(np.intp)]
     offset_s = np.asarray(boxes.offset_ns[:, None] * 1e-9, np.float64)
+    twist = np.where(offset_s < 0, registered.twist_before, registered.twist_after)
     return poses.exp(offset_s * twist) @ boxes.T_lidar_box
 
 

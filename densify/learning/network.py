@@ -35,9 +35,8 @@ from densify.readers.decoded_files import read_arrays
 
 CELL_M = 0.4
 NUM_CELLS = 256
-REACH_M = CELL_M * NUM_CELLS / 2
-"""Half side of the grid. Points farther from the scanner along x or y have no flow."""
-NUM_SWEEPS = 3
+REACH_M = CELL_M * NUM_CELLS / 2  # points farther from the scanner along x or y have no flow
+NUM_SWEEPS = 3  # of `order_for`
 _NUM_POINT_FEATURES = 6
 _WIDTH = 16
 _WIDTHS = (32, 48, 64, 96)
@@ -76,22 +75,18 @@ class AboveGround(NamedTuple):
         return NetworkCloud(points, torch.from_numpy(np.ascontiguousarray(self.height_m)))
 
 
-def order_for(source: int, target: int, num_sweeps: int, num_wanted: int) -> list[int | None]:
+def order_for(source: int, target: int, num_sweeps: int) -> list[int | None]:
     """Return the indices of the sweeps that the network needs for the flow from source to target.
 
-    They are source, target, and further sweeps on the other side of the source.
-
-    Args:
-        num_sweeps: Number of existing sweeps; other indices become None.
-        num_wanted: Number of sweeps that the network takes.
+    They are source, target, and the sweep on the other side of the source. An index that does not
+    exist among ``num_sweeps`` is None.
     """
-    step = source - target
-    wanted = [source, target, *(source + step * number for number in range(1, num_wanted - 1))]
+    wanted = source, target, 2 * source - target
     return [index if 0 <= index < num_sweeps else None for index in wanted]
 
 
 Sweeps = Sequence[NetworkCloud | None]
-"""Source, target, and any number of sweeps before the source; None for a missing sweep."""
+"""Source, target, and a sweep before the source; None for a missing sweep."""
 
 
 class Voxels(nn.Module):
@@ -120,29 +115,25 @@ class Voxels(nn.Module):
 
         Points off the grid have flow 0.
         """
-        clouds = [*sweeps[:NUM_SWEEPS], *[None] * (NUM_SWEEPS - len(sweeps))]
-        source = clouds[0]
+        source = sweeps[0]
         if source is None:
             raise ValueError("expected a source sweep")
-        pillars = [None if cloud is None else _Pillars.of(cloud) for cloud in clouds]
-        source_pillars = pillars[0]
-        grids, codes = [], source.points.new_zeros(0, _WIDTH)
-        for number, sweep_pillars in enumerate(pillars):
-            if sweep_pillars is None or not len(sweep_pillars.cell):
-                grids.append(source.points.new_zeros(NUM_CELLS**2, _WIDTH + 1))
-                continue
-            features = self.encode(sweep_pillars.features)
-            if number == 0:
-                codes = features
-            grids.append(sweep_pillars.as_grid(features))
-        flow = torch.zeros_like(source.points)
-        if source_pillars is None or not len(source_pillars.row):
+        flow, pillars = torch.zeros_like(source.points), _Pillars.of(source)
+        if not len(pillars.row):
             return flow
+        codes = self.encode(pillars.features)
+        grids = [pillars.as_grid(codes)]
+        for cloud in (*sweeps[1:], *[None] * (NUM_SWEEPS - len(sweeps))):
+            others = None if cloud is None else _Pillars.of(cloud)
+            if others is None or not len(others.row):
+                grids.append(flow.new_zeros(NUM_CELLS**2, _WIDTH + 1))
+            else:
+                grids.append(others.as_grid(self.encode(others.features)))
         image = torch.cat(grids, dim=1).view(1, NUM_CELLS, NUM_CELLS, -1).permute(0, 3, 1, 2)
         # The position of a point in its cell says more than the mean of the cell.
-        at_points = _at(self._unet(image), source_pillars)
-        decoded = self.decode(torch.cat([at_points, codes, source_pillars.features[:, :3]], dim=1))
-        return flow.index_copy(0, source_pillars.row, decoded)
+        at_points = _at(self._unet(image), pillars)
+        decoded = self.decode(torch.cat([at_points, codes, pillars.features[:, :3]], dim=1))
+        return flow.index_copy(0, pillars.row, decoded)
 
     def _unet(self, image: Tensor) -> Tensor:
         """Return the (1,32,128,128) codes of an image (1,C,256,256)."""
@@ -183,19 +174,14 @@ class _Block(nn.Module):
         return out
 
 
-class _Pillars:
+class _Pillars(NamedTuple):
     """The m points of one sweep within the grid, sorted by cell."""
 
-    # row: (m,) index into the sweep's points. cell: (m,) number of the cell. features: (m,6) offset
-    # from the cell's centre in cells, scaled height, and offset from the scanner in hundreds of
-    # metres. filled, size: (f,) number and point count of each cell with points. of_point: (m,) row
-    # in filled.
-
-    def __init__(self, row: Tensor, cell: Tensor, features: Tensor) -> None:
-        self.row, self.cell, self.features = row, cell, features
-        self.filled, self.of_point, self.size = torch.unique_consecutive(
-            cell, return_inverse=True, return_counts=True
-        )
+    row: Tensor  # (m,) index into the sweep's points
+    cell: Tensor  # (m,) number of the cell
+    # (m,6) offset from the cell's centre in cells, scaled height, and offset from the scanner in
+    # hundreds of metres
+    features: Tensor
 
     @staticmethod
     def of(cloud: NetworkCloud) -> _Pillars:
@@ -206,19 +192,21 @@ class _Pillars:
         number, order = torch.sort(cell[:, 1] * NUM_CELLS + cell[:, 0], stable=True)
         row = row[order]
         xy, height_m = xy[row], cloud.height_m[row].clamp(max=_LARGEST_HEIGHT_M)
-        features = torch.cat(
-            [xy - xy.floor() - 0.5, height_m[:, None] / 2 - 0.5, cloud.points[row] / 100.0], dim=1
-        )
-        return _Pillars(row, number, features)
+        offsets = xy - xy.floor() - 0.5, height_m[:, None] / 2 - 0.5, cloud.points[row] / 100.0
+        return _Pillars(row, number, torch.cat(offsets, dim=1))
 
     def as_grid(self, encoded: Tensor) -> Tensor:
         """Return (cells, C + 1): each cell's mean code, and the scaled log of its point count."""
-        zeros = encoded.new_zeros(len(self.size), encoded.shape[1])
-        sums = zeros.index_add(0, self.of_point, encoded)
-        size = self.size[:, None].to(sums.dtype)
+        # Number and point count of each cell with points, and its row there of each point
+        filled, of_point, counts = torch.unique_consecutive(
+            self.cell, return_inverse=True, return_counts=True
+        )
+        zeros = encoded.new_zeros(len(counts), encoded.shape[1])
+        sums = zeros.index_add(0, of_point, encoded)
+        size = counts[:, None].to(sums.dtype)
         columns = torch.cat([sums / size, torch.log1p(size) / 3], dim=1)
         grid = columns.new_zeros(NUM_CELLS**2, columns.shape[1])
-        return grid.index_copy(0, self.filled, columns)
+        return grid.index_copy(0, filled, columns)
 
 
 def _at(image: Tensor, pillars: _Pillars) -> Tensor:
@@ -231,8 +219,7 @@ def _at(image: Tensor, pillars: _Pillars) -> Tensor:
     return sampled[0, :, 0].T
 
 
-FORMAT, VERSION = "densify model", 1
-NETWORK = "voxels"
+_IDENTITY = {"format": "densify model", "version": 1, "network": "voxels"}
 _HEADER, _WEIGHTS = "header", "weights/"
 
 
@@ -252,8 +239,7 @@ class Model:
 
 def write_model(path: Path, model: Model) -> None:
     """Write a model file. The same model gives the same bytes."""
-    header = {"format": FORMAT, "version": VERSION, "network": NETWORK, "made": model.provenance}
-    text = json.dumps(header, sort_keys=True).encode()
+    text = json.dumps({**_IDENTITY, "made": model.provenance}, sort_keys=True).encode()
     arrays: dict[str, NDArray[Any]] = {_HEADER: np.frombuffer(text, np.uint8)}
     for name, tensor in model.network.state_dict().items():
         arrays[_WEIGHTS + name] = tensor.detach().cpu().numpy()
@@ -269,14 +255,13 @@ def read_model(path: Path) -> Model:
     arrays = read_arrays(path)
     try:
         header = dict(parse_json(bytes(arrays.pop(_HEADER).astype(np.uint8)), path))
-        identity = header["format"], header["version"], header["network"]
+        identity = tuple(header[name] for name in _IDENTITY)
         training = dict(header["made"])
     except (KeyError, ValueError, TypeError, InputError):
         raise InputError(f"{path}: no model that densify train flow wrote") from None
-    if identity != (FORMAT, VERSION, NETWORK):
-        raise InputError(
-            f"{path}: got {identity}, expected {(FORMAT, VERSION, NETWORK)}; train it again"
-        )
+    expected = tuple(_IDENTITY.values())
+    if identity != expected:
+        raise InputError(f"{path}: got {identity}, expected {expected}; train it again")
     network = build()
     weights = {name.removeprefix(_WEIGHTS): array for name, array in arrays.items()}
     if not all(np.isfinite(array).all() for array in weights.values()):

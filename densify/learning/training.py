@@ -33,7 +33,6 @@ from densify.flow.graph import knn_graph, laplacian
 from densify.free_space.ground import ground
 from densify.geometry.types import Bool, Float32, LidarSequence, Progress
 from densify.learning.network import (
-    NUM_SWEEPS,
     REACH_M,
     AboveGround,
     Model,
@@ -47,13 +46,12 @@ from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
 from densify.readers.street import Street
 
-STREETS = "streets"
-"""Recording specification: a new simulated street for every clip; options as of ``street``."""
+STREETS = "streets"  # specification of a new simulated street for every clip
 _PRESETS, _SHARES = ("street", "crossing", "highway"), (0.5, 0.25, 0.25)
 _RECORDED_POSES = {"register": {"source": "dataset"}}
 _CLIP_SWEEPS = 7
 _MAX_TRIES = 8  # key frames of a recording at which a clip may fail
-_NUM_MIXED = 4  # number of clips
+_NUM_MIXED = 4  # clips whose pairs are mixed
 _PAIRS_OF_CLIP = 48
 _MAX_DRAWN = 4096  # greatest number of points of source, and of target, in the objective
 _SCALES = (0.95, 1.05)
@@ -84,7 +82,7 @@ def train(training: Training, out: Path, progress: Progress | None = None) -> fl
         raise InputError(f"--steps {training.steps}: expected 1 or more")
     network = build(training.seed).to(device).train()
     optimizer = torch.optim.Adam(network.parameters(), lr=_LEARNING_RATE)
-    drawn = samples(ClipMaker(training.data, training.seed, training.teacher), NUM_SWEEPS)
+    drawn = samples(ClipMaker(training.data, training.seed, training.teacher))
     losses: list[float] = []
     with on_one_thread():
         while len(losses) < training.steps:
@@ -152,8 +150,7 @@ class ClipSweep:
     moving: Bool | None = None  # (n,) bool, None without labels
 
 
-Clip = tuple[ClipSweep, ...]
-"""Neighbouring sweeps in the order of time."""
+Clip = tuple[ClipSweep, ...]  # neighbouring sweeps in the order of time
 
 
 @dataclass(frozen=True)
@@ -202,13 +199,10 @@ def _new_street(spec: str, rng: np.random.Generator) -> LidarSequence:
 
 
 def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str) -> Clip:
-    """Return the clip of up to 7 sweeps around a key frame.
+    """Return the clip of up to 7 sweeps around a key frame, registered by the settings.
 
-    Args:
-        key: Frame number, in the middle of the clip unless the recording ends.
-        settings: Settings of registration and of the engine.
-        teacher: Source of the labels: "truth" for the ground truth, "engine" for the flow of the
-            engine ``groups``; other names give no labels.
+    Labels are the ground truth with the teacher "truth", and the flow of the engine ``groups`` with
+    "engine". Other teachers give no labels.
     """
     stretch = Recording(sequence, settings, _CLIP_SWEEPS // 2, [key]).window(key)
     heights, frames = ground(stretch), stretch.frames
@@ -261,8 +255,8 @@ class Sample(NamedTuple):
     moving: Any = None  # (n,) bool tensor, None without labels
 
 
-def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
-    """Yield samples without end, of clips from ``make``, for a network of ``num_wanted`` sweeps."""
+def samples(make: ClipMaker) -> Iterator[Sample]:
+    """Yield samples without end, of clips from ``make``."""
     for group in count():
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
@@ -270,7 +264,7 @@ def samples(make: ClipMaker, num_wanted: int) -> Iterator[Sample]:
         for row in rng.permutation(len(pairs)):
             pair_rng = np.random.default_rng([make.seed, group, 2, int(row)])
             clip, source, target = pairs[row]
-            yield sample_of(clip, source, target, num_wanted, pair_rng)
+            yield sample_of(clip, source, target, pair_rng)
 
 
 def _pairs(clip: Clip, rng: np.random.Generator) -> list[tuple[int, int]]:
@@ -283,19 +277,11 @@ def _pairs(clip: Clip, rng: np.random.Generator) -> list[tuple[int, int]]:
 
 
 def sample_of(
-    clip: Clip,
-    source: int,
-    target: int,
-    num_wanted: int,
-    rng: np.random.Generator | None = None,
+    clip: Clip, source: int, target: int, rng: np.random.Generator | None = None
 ) -> Sample:
-    """Return the training sample of two sweeps of a clip, with all points of both.
+    """Return the training sample of two neighbouring sweeps of a clip, by their indices.
 
-    Args:
-        source: Index of the source sweep in the clip.
-        target: Index of the target sweep, a neighbour of the source.
-        num_wanted: Number of sweeps that the network takes.
-        rng: Turns, mirrors, scales and draws the sample at random; None changes nothing.
+    ``rng`` turns, mirrors, scales and draws the sample at random. None changes nothing.
     """
     source_sweep, target_sweep = clip[source], clip[target]
     augmentation = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
@@ -306,7 +292,7 @@ def sample_of(
         points = torch.from_numpy((sweep.points - source_sweep.origin_m) @ augmentation.T)
         return NetworkCloud(points, torch.from_numpy(sweep.height_m * scale))
 
-    numbers = order_for(source, target, len(clip), num_wanted)
+    numbers = order_for(source, target, len(clip))
     sweeps = tuple(None if number is None else cloud(number) for number in numbers)
     points = cloud(source).points, cloud(target).points
     in_reach = [(xyz[:, :2].abs() < REACH_M).all(dim=1) for xyz in points]
@@ -362,4 +348,3 @@ def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 TEACHERS = {"objective": objective_loss, "engine": supervised_loss, "truth": supervised_loss}
-"""Loss function by teacher; it takes a network and a sample and returns a 0-d tensor."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TypeVar
 
@@ -16,14 +16,14 @@ from scipy.sparse.csgraph import connected_components
 
 from densify.free_space.ground import ABOVE_GROUND_M, HeightMap
 from densify.free_space.range_image import FreeSpace
+from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import num_threads
 from densify.geometry.nearest import close_to_seeds, link
-from densify.geometry.types import Bool, Float, Int, Stretch
+from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Stretch
 
 LINK_M = 0.6  # candidates closer to each other are one cluster
-_NEAR_M = 0.4  # greatest distance from a seed to a candidate
 MIN_SEED_SHARE = 0.4  # least share of seeds around a seed, and in a cluster that starts a track
 _RING_GAP_M = 0.35  # greatest distance between rings that are linked
 _STRIP = 32  # number of consecutive points in a strip
@@ -57,19 +57,11 @@ class Strips:
 
 
 @dataclass(frozen=True)
-class Candidates:
-    """The C points above the ground of one sweep, and which may move: see `Obstacles`."""
-
-    # The fields have the meaning of those of `Obstacles`. They do not depend on the world's origin.
-    row: Int
-    seed: Bool
-    cluster: Int
-    num_clusters: int
-
-
-@dataclass(frozen=True)
 class Obstacles:
-    """The C points above the ground (obstacles) in one sweep, or in a `Batch` of sweeps."""
+    """The C points above the ground (obstacles) in one sweep, or in a `Batch` of sweeps.
+
+    Candidates are those that may move.
+    """
 
     row: Int  # (C,) index into the sweep's points
     points: Float  # (C,3) world, registered and deskewed for ego-motion only
@@ -77,21 +69,6 @@ class Obstacles:
     seed: Bool  # (C,) True if another sweep saw through the point
     cluster: Int  # (C,) label of the cluster of candidates, -1 for other points
     num_clusters: int  # number of clusters; labels are below it
-
-    @staticmethod
-    def of(stretch: Stretch, i: int, candidates: Candidates) -> Obstacles:
-        """Return the obstacles of sweep i of the stretch, world frame, from its candidates."""
-        registered = stretch.sweeps[i]
-        return Obstacles(
-            row=candidates.row,
-            points=poses.transform(
-                registered.T_world_lidar, registered.sweep.points[candidates.row]
-            ),
-            time_s=firing_times_s(stretch, i, candidates.row),
-            seed=candidates.seed,
-            cluster=candidates.cluster,
-            num_clusters=candidates.num_clusters,
-        )
 
     @property
     def candidate(self) -> Bool:
@@ -130,11 +107,7 @@ class Batch:
         )
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Concatenate the arrays of this batch's sweeps to one, in the order of ``obstacles``.
-
-        Args:
-            columns: For every sweep of the stretch, an array with a value for each obstacle.
-        """
+        """Return the ``columns`` of this batch's sweeps, each (C,...), in one as ``obstacles``."""
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: Int) -> dict[int, Int]:
@@ -148,79 +121,64 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
     """Concatenate the obstacles of sweeps; clusters within `LINK_M` of each other become one."""
     if len(sweeps) == 1:
         return sweeps[0]
-    # Every sweep counts its clusters from 0. An offset makes the labels unique.
-    first_labels = np.cumsum([0] + [sweep.num_clusters for sweep in sweeps]).tolist()
-    num_labels = first_labels[-1]
-    label = np.concatenate(
-        [
-            np.where(sweep.candidate, sweep.cluster + first_label, -1)
-            for sweep, first_label in zip(sweeps, first_labels[:-1], strict=True)
-        ]
+    row, points, time_s, seed, label = (
+        np.concatenate([getattr(sweep, column.name) for sweep in sweeps])
+        for column in fields(Obstacles)[:-1]
     )
+    # Every sweep counts its clusters from 0. An offset makes the labels unique.
+    first_labels = np.cumsum([0] + [sweep.num_clusters for sweep in sweeps])
+    candidate = np.flatnonzero(label >= 0)
+    label[candidate] += np.repeat(first_labels[:-1], [s.candidate.sum() for s in sweeps])
     # Two clusters are merged if they share a group: points of all sweeps that are linked. The nodes
     # of the graph are clusters, then groups. Each candidate is an edge between its cluster and its
     # group, and the connected components are the merged clusters.
-    points = np.concatenate([sweep.points for sweep in sweeps])
-    candidate = np.flatnonzero(label >= 0)
     num_groups, group = link(points[candidate], LINK_M)
-    num_nodes = num_labels + num_groups
-    edges = label[candidate], num_labels + group
+    num_nodes = int(first_labels[-1]) + num_groups
+    edges = label[candidate], first_labels[-1] + group
     graph = coo_array((np.ones(len(candidate), bool), edges), shape=(num_nodes, num_nodes))
     num_clusters, cluster = connected_components(graph, directed=False)
     label[candidate] = cluster[label[candidate]]
-    return Obstacles(
-        row=np.concatenate([sweep.row for sweep in sweeps]),
-        points=points,
-        time_s=np.concatenate([sweep.time_s for sweep in sweeps]),
-        seed=np.concatenate([sweep.seed for sweep in sweeps]),
-        cluster=label,
-        num_clusters=int(num_clusters),
-    )
+    return Obstacles(row, points, time_s, seed, label, int(num_clusters))
 
 
-def find_candidates(
-    stretch: Stretch, space: FreeSpace, ground: HeightMap, among: Sequence[int] | None = None
-) -> tuple[Candidates, ...]:
+def find_candidates(stretch: Stretch, space: FreeSpace, ground: HeightMap) -> tuple[Obstacles, ...]:
     """Return, for each sweep in order, its points above the ground, and which of them may move.
 
     A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
     because usually only a part of a moving object's points is seen through.
-
-    Args:
-        among: Indices of the sweeps to return, None for all.
     """
 
-    def find_in_sweep(i: int) -> Candidates:
+    def find_in_sweep(i: int) -> Obstacles:
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         rows = np.flatnonzero(ground.above(points) >= ABOVE_GROUND_M)
-        points_above = points[rows]
+        points = points[rows]
         seed = np.zeros(len(rows), bool)
         for j in space.others(i):
             unmarked = np.flatnonzero(~seed)  # one sweep that saw through a point is enough
-            seed[unmarked] = space.seen_through(points_above[unmarked], j)
-        gap_m = space.sensors.gap_m(registered.sweep.points[rows], registered.sweep.lidar[rows])
-        compressed = compress_heights(points_above - registered.T_world_lidar[:3, 3], gap_m)
-        num_clusters, cluster = cluster_around(compressed, seed)
-        return Candidates(rows, seed, cluster, num_clusters)
+            seed[unmarked] = space.seen_through(points[unmarked], j)
+        num_clusters, cluster = cluster_rings(points, rows, seed, registered, space.sensors)
+        time_s = firing_times_s(stretch, i, rows)
+        return Obstacles(rows, points, time_s, seed, cluster, num_clusters)
 
     with ThreadPoolExecutor(num_threads()) as pool:
-        sweeps = range(len(stretch.sweeps)) if among is None else among
-        return tuple(pool.map(find_in_sweep, sweeps))
+        return tuple(pool.map(find_in_sweep, range(len(stretch.sweeps))))
 
 
-def compress_heights(points: Float, gap_m: Float) -> Float:
-    """Return the (N,3) points, with heights compressed until rings are at most 0.35 m apart.
+def cluster_rings(
+    points: Float, rows: Int, seed: Bool, registered: RegisteredSweep, sensors: Sensors
+) -> tuple[int, Int]:
+    """Return the clusters of a sweep's points (N,3), world, at ``rows``, see `cluster_around`.
 
-    Otherwise the rings of an object would be too far apart to be linked.
-
-    Args:
-        points: (N,3) metres, z up, relative to the scanner: level surfaces then stay level.
-        gap_m: (N,) distance between neighbouring rings at each point, metres.
+    Heights are compressed until rings are at most 0.35 m apart. Otherwise the rings of an object
+    would be too far apart to be linked.
     """
-    compressed = points.copy()
+    sweep = registered.sweep
+    gap_m = sensors.gap_m(sweep.points[rows], sweep.lidar[rows])
+    # Relative to the scanner, level surfaces stay level.
+    compressed = points - registered.T_world_lidar[:3, 3]
     compressed[:, 2] *= np.minimum(1.0, _RING_GAP_M / np.maximum(gap_m, 1e-6))
-    return compressed
+    return cluster_around(compressed, seed)
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
@@ -232,18 +190,14 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Return the clusters of seeds and of points within 0.4 m of seeds, linked within 0.6 m.
+    """Return the clusters of seeds and of points (N,3) within 0.4 m of seeds, linked within 0.6 m.
 
     Seeds with a share of other seeds below 0.4 around them, as in a hedge, do not count.
-
-    Args:
-        points: (N,3) metres.
-        seed: (N,) True for seeds.
 
     Returns:
         The number of clusters, and (N,) labels from 0, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
-    rows = np.flatnonzero(close_to_seeds(points, seed, _NEAR_M, MIN_SEED_SHARE))
+    rows = np.flatnonzero(close_to_seeds(points, seed, 0.4, MIN_SEED_SHARE))
     num_clusters, cluster[rows] = link(points[rows], LINK_M)
     return num_clusters, cluster

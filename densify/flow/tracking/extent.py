@@ -25,12 +25,8 @@ Instance = NDArray[np.int32]
 
 _REACH = 1.5  # greatest distance of a candidate from its object, in neighbour distances (`near_m`)
 _MIN_HEIGHT_M, _MIN_WALKER_HEIGHT_M = 0.08, 0.1  # above the ground
-_MAX_WALKER_SPEED_M_S = 2.0  # greatest speed of walkers
-# Shapes of walkers: least share of seeds near a point, greatest length
-_MIN_SEED_SHARE, _MAX_WALKER_M = 0.1, 1.5
-_AROUND_M, _MIN_MOVING_SHARE = 0.5, 0.5  # least share of moving points within this distance
-NUM_COLUMNS = 2.0
-"""Columns of rays that may be missing along a side that recedes from the scanner."""
+_MAX_WALKER_SPEED_M_S = 2.0
+_MAX_WALKER_M = 1.5  # greatest length of a walker's shape
 _LONGEST_HOLE_M = 2.0  # longest hole in a side
 _MAX_VIOLATIONS = 0.05  # greatest share of seen-through points in an extension
 
@@ -88,9 +84,6 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     - Points of a bush. They are static, or lie among static points.
     - Points of a wall. They are hardly ever seen through. Sides of slow cars are alike, hence
       these points are dropped only if the rest is shorter than 1.5 m.
-
-    Args:
-        obstacles: Points above the ground of each sweep of the stretch.
     """
     sweeps = sorted(track.claimed)
     clouds = {j: track.in_object(obstacles[j], track.claimed[j]) for j in sweeps}
@@ -102,10 +95,11 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     sweep_number = np.repeat(np.arange(len(sweeps)), [len(cloud) for cloud in clouds.values()])
     recurs = _recurs(points, sweep_number, _REACH * neighbour_m)
     is_moving = ~_is_static(track, obstacles, clouds, sweep_number, neighbour_m)
-    is_own = recurs & is_moving & close_to_seeds(points, is_moving, _AROUND_M, _MIN_MOVING_SHARE)
+    # Half of the points within 0.5 m move too.
+    is_own = recurs & is_moving & close_to_seeds(points, is_moving, 0.5, 0.5)
     seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
-    # The third kind: points without seeds, which other sweeps hardly ever saw through
-    is_core = is_own & close_to_seeds(points, seed, _REACH * neighbour_m, _MIN_SEED_SHARE)
+    # The third kind: points with less than 10 % seeds around, hardly ever seen through
+    is_core = is_own & close_to_seeds(points, seed, _REACH * neighbour_m, 0.1)
     if is_core.any() and np.linalg.norm(np.ptp(points[is_core, :2], axis=0)) < _MAX_WALKER_M:
         return Shape.of(points[is_core])
     return Shape.of(points[is_own] if is_own.any() else points)  # a shape needs points
@@ -154,31 +148,23 @@ def assign_points(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
 ) -> list[Instance]:
-    """Return, for each sweep of a batch, (N,) the index of each point's object, -1 for none.
-
-    Args:
-        batch: Indices of the batch's sweeps.
-        objects: Confirmed objects.
-        obstacles: Points above the ground of each sweep of the stretch.
-    """
+    """Return, for each sweep of a batch, (N,) the index of each point's object, -1 for none."""
     clouds = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = [
-        attach(cloud, i, objects, space.clock) for i, cloud in zip(batch, clouds, strict=True)
+        _attach(cloud, i, objects, space.clock) for i, cloud in zip(batch, clouds, strict=True)
     ]
     # Vehicles are extended by the points of the whole batch at once.
     batch_instance = np.concatenate(attached)
-    extend_vehicles(batch_instance, SweepPoints.concatenate(clouds), batch[0], objects, space)
-    ends = np.cumsum([len(sweep_instance) for sweep_instance in attached])
-    extended = np.split(batch_instance, ends[:-1])
-    instances = []
-    for i, cloud, sweep_instance in zip(batch, clouds, extended, strict=True):
-        instance = np.full(len(stretch.sweeps[i].sweep), -1, np.int32)
-        instance[cloud.row] = sweep_instance
-        instances.append(instance)
+    _extend_vehicles(batch_instance, SweepPoints.concatenate(clouds), batch[0], objects, space)
+    instances = [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in batch]
+    begin = 0
+    for cloud, instance in zip(clouds, instances, strict=True):
+        instance[cloud.row] = batch_instance[begin : begin + len(cloud.row)]
+        begin += len(cloud.row)
     return instances
 
 
-def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
+def _attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
     """Return (N,) the index in ``objects`` of the nearest object at each point of a sweep, or -1.
 
     ``cloud`` holds the N points of sweep index i. A point belongs to an object if it lies near the
@@ -211,7 +197,7 @@ def attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: C
     return instance
 
 
-def extend_vehicles(
+def _extend_vehicles(
     instance: Instance,
     cloud: SweepPoints,
     i: int,
@@ -222,13 +208,8 @@ def extend_vehicles(
 
     The middle of a long side that moves along itself is never seen through, and lacks candidates.
     Vehicles are objects faster than 2 m/s. The extension ends at a hole (0.6 to 2 m, by the spacing
-    of the rays), or where another sweep sees through more than 5 % of the moved points.
-
-    Args:
-        instance: (N,) index of each point's object, -1 for none; changed in place.
-        cloud: The N points of a batch.
-        i: Index of the first sweep of the batch.
-        objects: Confirmed objects.
+    of the rays), or where another sweep sees through more than 5 % of the moved points. The cloud
+    holds the N points of a batch whose first sweep has index i.
     """
     for k, moving_object in enumerate(objects):
         track, shape = moving_object
@@ -242,8 +223,8 @@ def extend_vehicles(
         # Only points that are linked with the object, by coordinates along the heading
         members_at_one_time = track.carry(cloud.points[members], cloud.time_s[members], at_s)
         members_m = members_at_one_time[:, :2] @ lane.ahead
-        columns_m = columns_apart_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
-        hole_m = float(np.clip(NUM_COLUMNS * columns_m, LINK_M, _LONGEST_HOLE_M))
+        columns_m = two_columns_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
+        hole_m = float(np.clip(columns_m, LINK_M, _LONGEST_HOLE_M))
         is_linked = _is_linked(along_m, members_m, hole_m)
         # Of these, only points up to the first violations
         if is_linked.any():
@@ -269,21 +250,18 @@ def _free_rows_in_lane(
     return near_rows[in_lane], at_one_time[in_lane, :2] @ lane.ahead
 
 
-def columns_apart_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
-    """Return the distance (m) along a side between neighbouring columns of rays that hit it.
+def two_columns_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sensors) -> float:
+    """Return the distance (m) over two columns of rays on a side that recedes from the scanner.
 
-    Args:
-        point: (3,) a point of the side, world.
-        ahead: (2,) unit vector along the side, world.
-        T_lidar_world: (4,4) inverse of the lidar's pose.
+    The side contains a point (3,) and runs along a unit vector ``ahead`` (2,), both world.
     """
-    # Two rays that differ by a small angle hit the side (angle x range² / distance of the side's
-    # line from the lidar) apart.
+    # Two columns, because one may lack returns. Two rays that differ by a small angle hit the side
+    # (angle x range² / distance of the side's line from the lidar) apart.
     in_lidar = poses.transform(T_lidar_world, point[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
     aside_m = max(abs(float(in_lidar @ [-y, x])), 1e-3)
     column_rad = min(model.azimuth_step_rad for model in sensors.models.values())
-    return column_rad * float(in_lidar @ in_lidar) / aside_m
+    return 2 * (column_rad * float(in_lidar @ in_lidar) / aside_m)
 
 
 def _is_linked(along_m: Float, members_m: Float, hole_m: float) -> Bool:

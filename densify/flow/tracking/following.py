@@ -7,9 +7,8 @@ with the object so far, from the pose of constant speed and turn rate.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +16,11 @@ from scipy.spatial import cKDTree
 
 from densify.flow.surface_matching import GATES_M, MIN_FIT, Model, apply, undo
 from densify.flow.tracking.candidates import LINK_M, MIN_SEED_SHARE, Batch, Obstacles
-from densify.flow.tracking.objects import BESIDE_M, MovingObject, Track
+from densify.flow.tracking.objects import Track
 from densify.free_space.ground import HeightMap
 from densify.geometry.clock import Clock
 from densify.geometry.compiled import Kernel
-from densify.geometry.nearest import bulk, is_near, nearest, tree_of
+from densify.geometry.nearest import bulk, nearest, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 Bytes = NDArray[np.uint8]
@@ -31,7 +30,6 @@ _NEAR_S, _AROUND_S = 0.1, 0.5  # times to the nearest and the farthest batches t
 STEP_M = 0.2  # side of a voxel
 _MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
 FEW_POINTS, _MANY_POINTS = 60, 600  # points of a cluster in the first vote, and in later votes
-_FINE_M_S = 0.2  # velocity step of the last vote: half a voxel in 0.5 s
 
 
 @dataclass(frozen=True)
@@ -40,14 +38,12 @@ class DistanceField:
 
     nearness: Bytes  # (X,Y,Z) voxels of 0.2 m: 255 at a candidate, falling to 0 at 0.6 m from it
     low: Float  # (3,) corner of the grid, world
-    tree: cKDTree | None  # search tree of the N candidates; None without candidates
+    tree: cKDTree  # search tree of the N candidates
     time_s: Float  # (N,) firing times of the candidates
 
     @staticmethod
     def of(points: Float, time_s: Float) -> DistanceField:
-        """Build the field of N candidates from points (N,3, world) and firing times (N,)."""
-        if not len(points):
-            return DistanceField(np.zeros((1, 1, 1), np.uint8), np.zeros(3), None, time_s)
+        """Build the field of N > 0 candidates from points (N,3, world) and firing times (N,)."""
         # The margin of the grid is wider than the reach of a candidate.
         inside = points[bulk(points, STEP_M, _MOST_VOXELS)]
         low = inside.min(0) - 2 * LINK_M
@@ -69,8 +65,6 @@ class DistanceField:
         Nearness is from 0 (no candidate within 0.6 m) to 255. The points are moved at velocities
         (V,3), m/s, world, to the time when this sweep fired at the new position.
         """
-        if self.tree is None:
-            return
         # The firing time depends on the position, and the position on the time. Each is taken from
         # the nearest candidate, first at the group's old position, then at the moved position.
         _, old_neighbour = nearest(self.tree, group.middle[None])
@@ -114,18 +108,13 @@ class Group:
 
 
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
-    """Return the horizontal velocity (3,) of a cluster, m/s, that the neighbouring sweeps support.
+    """Return the horizontal velocity (3,), m/s, of a cluster of batch n that other sweeps support.
 
-    At this velocity the group comes nearest to candidates of other batches. First the batches about
-    0.1 and 0.2 s before and after are compared, in coarse steps of velocity. A flat side shows its
-    speed only at its ends, which move by less than a voxel in this short time. Therefore batches up
-    to 0.5 s away are compared too, in fine steps.
-
-    Args:
-        group: The cluster's points in batch n.
-        n: Index of the cluster's batch.
-        fields: For each batch, the distance fields of its sweeps.
-        clock: Times of the batches.
+    At this velocity the group comes nearest to candidates of other batches, by the ``fields`` of
+    the sweeps of each batch. First the batches about 0.1 and 0.2 s before and after are compared,
+    in coarse steps of velocity. A flat side shows its speed only at its ends, which move by less
+    than a voxel in this short time. Therefore batches up to 0.5 s away are compared too, in fine
+    steps.
     """
     near_step_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
     # The farthest batches are two of these steps away.
@@ -141,8 +130,8 @@ def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock:
     many_points = group.thinned(_MANY_POINTS)
     medium_grid = coarse_m_s + _grid(6) * coarse_step_m_s / 3
     medium_m_s = _best_velocity(many_points, near_fields, medium_grid)
-    # Last vote: steps of about 0.2 m/s, up to one step of the second vote to each side
-    num_steps = max(1, round(coarse_step_m_s / 3 / _FINE_M_S))
+    # Last vote: steps of about 0.2 m/s (half a voxel in 0.5 s), up to one medium step to each side
+    num_steps = max(1, round(coarse_step_m_s / 3 / 0.2))
     fine_grid = medium_m_s + _grid(num_steps) * coarse_step_m_s / 3 / num_steps
     return _best_velocity(many_points, all_fields, fine_grid)
 
@@ -217,36 +206,28 @@ def _look_up(
 
 
 MIN_POINTS = 8  # to start a track
-# Factor of the rank of a start for each 0.1 s by which it is less than 0.5 s away from the first or
-# last sweep: fewer sweeps vote for its velocity.
-_END_FACTOR = 0.7
-FIT_M = 0.3
-"""Greatest distance of a point from the object that claims it."""
-# Without candidates: least number of points, as a share of the object's usual number
-_MIN_SHARE_WITHOUT_CANDIDATES = 0.5
+FIT_M = 0.3  # greatest distance of a point from the object that claims it
 # Standard deviation (m, m, rad) of a prediction over 0.25 s; it grows with longer times.
 PREDICTION_STD, _PREDICTION_S = np.array([0.3, 0.3, 0.06]), 0.25
 _RECENT_S = 0.4  # age of the states that the rate is fitted to
 # Weight of the velocity that a track starts at: that of states with this sum of squared times, such
 # as two states 0.2 s apart
 _START_RATE_S2 = 0.02
-_TURN_RATE_SHARE = 0.9  # share of the measured turn rate that is predicted, because turns end
-# A track ends if the object is not found in more batches, and for a longer time.
-_MAX_MISSED_BATCHES, MAX_MISSED_S = 1, 0.2
+MAX_MISSED_S = 0.2  # time without points after which a track ends
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
     """Return the clusters that may start a track: batch index, (K,) rows of the batch's obstacles.
 
-    They have at least 8 points, 40 % of them seeds. The largest come first; those less than 0.5 s
-    from an end of the stretch count as smaller.
+    They have at least 8 points, 40 % of them seeds. The largest come first. A cluster nearer to an
+    end of the stretch than 0.5 s counts as smaller: fewer sweeps vote for its velocity.
     """
     starts = []
 
     def rank(start: tuple[int, Int]) -> float:
         n, members = start
         nearer_s = max(0.0, _AROUND_S - clock.from_end_s(n))
-        return float(len(members) * _END_FACTOR ** (nearer_s / _NEAR_S))
+        return float(len(members) * 0.7 ** (nearer_s / _NEAR_S))
 
     for n, obstacles in enumerate(batches):
         cluster, candidate = obstacles.cluster, obstacles.candidate
@@ -256,41 +237,6 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
         may_start = (size >= MIN_POINTS) & (num_seeds >= MIN_SEED_SHARE * size)
         starts += [(n, np.flatnonzero(cluster == k)) for k in np.flatnonzero(may_start)]
     return sorted(starts, key=rank, reverse=True)
-
-
-def find_nearby_velocities(
-    batch: Batch, members: Int, objects: Sequence[MovingObject]
-) -> Iterator[Float]:
-    """Yield the velocity (3,), m/s, of each object within 1 m of a cluster.
-
-    A trailer has the velocity of the car that tows it. The measurements alone hardly show how fast
-    a long flat side moves along itself.
-
-    Args:
-        batch: Sweeps in which the cluster was found.
-        members: Rows of the cluster in the batch's obstacles.
-        objects: Confirmed objects.
-    """
-    points = batch.obstacles.points[members]
-    tree = tree_of(points)
-    middle = points.mean(0, keepdims=True)
-    for moving_object in objects:
-        track = moving_object.track
-        at_s = track.seen_at(batch.time_ns)
-        if not moving_object.may_be_near(points, at_s, BESIDE_M):
-            continue
-        object_points = track.place(moving_object.shape.points, at_s)
-        if is_near(tree, object_points, BESIDE_M).any():
-            yield track.velocity_m_s(middle, at_s)[0]
-
-
-class _Sighting(NamedTuple):
-    """The points of an object found in one batch."""
-
-    state: Float  # (4,) state of the object
-    seen_s: float  # mean firing time of the points
-    rows: Int  # (K,) rows of the batch's obstacles
-    points: Float  # (K,3) positions at ``seen_s``, world
 
 
 @dataclass(frozen=True)
@@ -305,13 +251,9 @@ class Follower:
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
         """Return the track of a cluster, followed forwards in time, then backwards.
 
-        All points found so far, in the object's frame, are the model that later points are aligned
-        with.
-
-        Args:
-            members: Rows of the cluster in the obstacles of batch ``start``.
-            start: Batch index of the cluster.
-            velocity: (3,) m/s, world, at which the track starts.
+        The cluster is at rows ``members`` of the obstacles of batch ``start``. Its track starts at
+        a velocity (3,), m/s, world. All points found so far, in the object's frame, are the model
+        that later points are aligned with.
         """
         batch = self.batches[start]
         rate = np.append(velocity, 0.0)  # of the state, without a turn
@@ -323,22 +265,17 @@ class Follower:
         for direction in (1, -1):
             last_found = start  # batch index
             n = start + direction
-            while 0 <= n < len(self.batches) and self._is_within_reach(last_found, n):
-                sighting = self._find(model, track, rate, n)
-                if sighting is not None:
+            # An object that was not found in two batches may be found again within 0.2 s.
+            while 0 <= n < len(self.batches) and (
+                abs(n - last_found) <= 2 or self.clock.near(n, last_found, MAX_MISSED_S)
+            ):
+                if self._extend(track, model, rate, n):
                     last_found = n
-                    track.add(n, self.batches[n], sighting.state, sighting.seen_s, sighting.rows)
-                    model.add(undo(sighting.state, sighting.points, track.centre))
                 n += direction
         return track
 
-    def _is_within_reach(self, last_found: int, n: int) -> bool:
-        """Return True if an object last found in a batch may be found again in batch n."""
-        num_missed = abs(n - last_found) - 1
-        return num_missed <= _MAX_MISSED_BATCHES or self.clock.near(n, last_found, MAX_MISSED_S)
-
-    def _find(self, model: Model, track: Track, rate: Float, n: int) -> _Sighting | None:
-        """Return where the object is in batch n, None if too few points fit its model."""
+    def _extend(self, track: Track, model: Model, rate: Float, n: int) -> bool:
+        """Add the object's points in batch n to both; False if too few points fit the model."""
         centre = track.centre
         batch = self.batches[n]
         obstacles = batch.obstacles
@@ -346,10 +283,9 @@ class Follower:
 
         # Phase 1: free obstacles in the box around the expected position. The firing time of the
         # points is not known yet, hence the box grows by the motion within the batch.
-        expected_s = track.seen_at(batch.time_ns)
-        expected = _predict(track, rate, num_recent, expected_s)
-        expected_points = apply(expected.state, model.points, centre)
-        slack_m = GATES_M[0] + batch.half_s * np.abs(expected.rate[:3])
+        expected, expected_rate, _ = _predict(track, rate, num_recent, track.seen_at(batch.time_ns))
+        expected_points = apply(expected, model.points, centre)
+        slack_m = GATES_M[0] + batch.half_s * np.abs(expected_rate[:3])
         low, high = expected_points.min(0) - slack_m, expected_points.max(0) + slack_m
         free_rows = obstacles.strips.rows_inside(low, high)
         free_rows = free_rows[batch.gather(self.is_free)[free_rows]]
@@ -357,27 +293,30 @@ class Follower:
         min_num_rows = float(MIN_FIT)
         if len(rows) < MIN_FIT:
             # No sweep saw through the object here, hence it has no candidates. Other obstacles are
-            # the object if they are nearly as many as usual.
+            # the object if they are at least half as many as usual.
             usual_num = float(np.median([track.num_points(m) for m in track.observations]))
             rows = free_rows
-            min_num_rows = max(MIN_FIT, _MIN_SHARE_WITHOUT_CANDIDATES * usual_num)
+            min_num_rows = max(MIN_FIT, usual_num / 2)
         if len(rows) < min_num_rows:
-            return None
+            return False
 
         # Phase 2: alignment with the model, from the state predicted for the mean firing time
         seen_s = float(obstacles.time_s[rows].mean())
-        predicted = _predict(track, rate, num_recent, seen_s)
-        predicted.state[2] = track.rise_m(self.ground, predicted.state)
-        points = _at_once(obstacles, rows, predicted.rate, seen_s)
-        state = model.align(points, centre, predicted.state, predicted.std)
+        predicted, predicted_rate, std = _predict(track, rate, num_recent, seen_s)
+        predicted[2] = track.rise_m(self.ground, predicted)
+        points = _at_once(obstacles, rows, predicted_rate, seen_s)
+        state = model.align(points, centre, predicted, std)
         if state is None:
-            return None
+            return False
         state[2] = track.rise_m(self.ground, state)
         # Phase 3: only points that lie on the aligned model belong to the object.
-        fits = model.covers(undo(state, points, centre), FIT_M)
+        in_object = undo(state, points, centre)
+        fits = model.covers(in_object, FIT_M)
         if fits.sum() < min_num_rows:
-            return None
-        return _Sighting(state, seen_s, rows[fits], points[fits])
+            return False
+        track.add(n, batch, state, seen_s, rows[fits])
+        model.add(in_object[fits])
+        return True
 
 
 def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
@@ -386,16 +325,13 @@ def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Flo
     return obstacles.points[rows] + offset_s[:, None] * rate[:3]
 
 
-class _Prediction(NamedTuple):
-    """The expected motion of an object at one time."""
+def _predict(
+    track: Track, start_rate: Float, num_recent: int, time_s: float
+) -> tuple[Float, Float, Float]:
+    """Predict state (4,), rate (4,) per second and std (3,) of x, y, yaw from the nearest states.
 
-    state: Float  # (4,) state of the object
-    rate: Float  # (4,) derivative of the state per second
-    std: Float  # (3,) standard deviation of x, y (m) and yaw (rad)
-
-
-def _predict(track: Track, start_rate: Float, num_recent: int, time_s: float) -> _Prediction:
-    """Predict an object's state from the nearest states, at constant speed and turn rate."""
+    Speed and turn rate are constant.
+    """
     # The velocity turns with the object (Schubert, Richter, Wanielik, "Comparison and Evaluation of
     # Advanced Motion Models for Vehicle Tracking", FUSION 2008).
     nearest_first = sorted(
@@ -416,12 +352,12 @@ def _predict(track: Track, start_rate: Float, num_recent: int, time_s: float) ->
         weight_s2 = np.full(4, _START_RATE_S2 * (first_batch in recent))
         weight_s2[3] = 0
         rate = (centred_s @ states + weight_s2 * start_rate) / (centred_s @ centred_s + weight_s2)
-        rate[3] *= _TURN_RATE_SHARE
+        rate[3] *= 0.9  # turns end
     std = PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
     # The slope is the rate at the mean time of the states. At constant turn rate, the mean rate
     # between the nearest state and ``time_s`` is the rate halfway between them.
     mean_rate = _turn(rate, time_s - 0.5 * ahead_s - middle_s)
-    return _Prediction(states[0] + mean_rate * ahead_s, _turn(rate, time_s - middle_s), std)
+    return states[0] + mean_rate * ahead_s, _turn(rate, time_s - middle_s), std
 
 
 def _turn(rate: Float, duration_s: float) -> Float:

@@ -13,9 +13,9 @@ import numpy as np
 
 from densify.config import Config
 from densify.flow.engines import Scene
-from densify.flow.tracking.candidates import Candidates, Obstacles, firing_times_s
+from densify.flow.tracking.candidates import Obstacles, firing_times_s
 from densify.flow.tracking.extent import Instance, assign_points, find_shape, is_tracked_at
-from densify.flow.tracking.objects import MovingObject, Shape, Track, near_m
+from densify.flow.tracking.objects import Lane, MovingObject, Shape, Track, near_m
 from densify.flow.tracking.soften import Snapshot, Softened, soften
 from densify.flow.tracking.tracks import find_tracks
 from densify.free_space.range_image import FreeSpace
@@ -57,8 +57,7 @@ class GroupMotion:
         track_of_point = self.track_of_point[i]
         R_lidar_world = registered.T_world_lidar[:3, :3].T
         clock = Clock.of(self.stretch)
-        source_s = clock.time_s[i]
-        target_s = clock.time_s[j]
+        source_s, target_s = clock.time_s[i], clock.time_s[j]
         to_reference, displacement, velocity_m_s = np.zeros((3, len(track_of_point), 3))
         lost = np.zeros(len(track_of_point), bool)
         for k, rows in _rows_by_track(track_of_point):
@@ -93,9 +92,8 @@ class Bending:
     def carry(self, i: int, j: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
         """Return sweep i's N points at the reference times of sweeps i and j: two (N,3) arrays.
 
-        Both are in the object's frame, in metres. ``seen_s`` (N,) are the points' firing times. The
-        object has points in sweep i. If it has none in sweep j, it bends as in the sweep nearest in
-        time that has some.
+        Both are in the object's frame, in metres. ``seen_s`` (N,) are the points' firing times. An
+        object without points in sweep j bends as in the nearest sweep with some.
         """
         source = self.sweeps.index(i)
         target = self.sweeps.index(clock.nearest(j, self.sweeps))
@@ -111,26 +109,23 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> GroupMotio
 
     Below 10 Hz, objects that turn, bend or are occluded between sweeps are tracked worse or lost.
     """
-    return find_group_motion(scene, scene.candidates)
+    return find_group_motion(scene, scene.obstacles)
 
 
 def find_group_motion(
     scene: Scene,
-    candidates: Sequence[Candidates],
+    obstacles: Sequence[Obstacles],
     velocities_m_s: Sequence[Float] | None = None,
 ) -> GroupMotion:
     """Return the motion of the objects found among the points of each sweep that may move.
 
     Args:
         scene: Registered sweeps. Points of batches without a sweep that is asked for stay static.
-        candidates: For each sweep, its C points above the ground, and which may move.
+        obstacles: For each sweep, its C points above the ground, and which may move.
         velocities_m_s: For each sweep, (C,3) approximate velocities of these points, world frame.
             None estimates them by a vote of neighbouring sweeps.
     """
     stretch, space = scene.stretch, scene.space
-    obstacles = [
-        Obstacles.of(stretch, i, sweep_candidates) for i, sweep_candidates in enumerate(candidates)
-    ]
     tracks = find_tracks(obstacles, space, scene.ground, velocities_m_s)
     objects = [MovingObject(track, find_shape(track, obstacles, space)) for track in tracks]
 
@@ -139,27 +134,27 @@ def find_group_motion(
             return assign_points(batch, stretch, scene.ground, objects, obstacles, space)
         return [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in batch]
 
-    def bend(k: int) -> Bending:
-        return _find_bending(k, tracks[k], stretch, track_of_point)
-
     with ThreadPoolExecutor(num_threads()) as pool:
         own_track = tuple(chain.from_iterable(pool.map(assign_batch, space.batches)))
-        joined = join_pieces(stretch, tracks, own_track, space)
+        object_of_track, carrier_of_track = join_pieces(stretch, tracks, own_track, space)
         # Points move with the carrier of their track. The last entry, at index -1, is static.
-        carrier: Instance = np.append(joined.carrier_of_track, -1).astype(np.int32)
+        carrier: Instance = np.append(carrier_of_track, -1).astype(np.int32)
         track_of_point = tuple(carrier[sweep_track] for sweep_track in own_track)
         near_tracks = [
             k
             for k, track in enumerate(tracks)
             if space.gap_m(track.centre, min(track.claimed)) <= _MAX_BENDING_GAP_M
         ]
+        found = pool.map(
+            lambda k: _find_bending(k, tracks[k], stretch, track_of_point), near_tracks
+        )
         # Objects of infinite stiffness are rigid.
         bendings = {
             k: bending
-            for k, bending in zip(near_tracks, pool.map(bend, near_tracks), strict=True)
+            for k, bending in zip(near_tracks, found, strict=True)
             if np.isfinite(bending.softened.alpha)
         }
-    return GroupMotion(stretch, tuple(tracks), track_of_point, bendings, joined.object_of_track)
+    return GroupMotion(stretch, tuple(tracks), track_of_point, bendings, object_of_track)
 
 
 def _find_bending(
@@ -197,13 +192,6 @@ _MIN_LENGTH_RATIO = 0.75
 _MAX_DIFFERENCE_M_S = 0.4  # twice the error of the velocity of a long track
 
 
-class JoinedObjects(NamedTuple):
-    """The objects of K tracks."""
-
-    object_of_track: Int  # (K,) number of the object that each track belongs to
-    carrier_of_track: Int  # (K,) index of the track with which the points of each track move
-
-
 class _Piece(NamedTuple):
     """The points of one track, by sweep index."""
 
@@ -211,11 +199,6 @@ class _Piece(NamedTuple):
     points: dict[int, Float]  # sweep index -> (N,3) measured positions, world
     seen_s: dict[int, Float]  # sweep index -> (N,) firing times
     near_m: dict[int, Float]  # sweep index -> (N,) neighbour distances
-
-    @property
-    def num_points(self) -> int:
-        """The number of points in all sweeps."""
-        return sum(map(len, self.points.values()))
 
     def in_object(self, track: Track, sweeps: Sequence[int]) -> Float:
         """Return the (N,3) points of some sweeps (by index) in the object's frame of a track."""
@@ -225,19 +208,23 @@ class _Piece(NamedTuple):
 
 def join_pieces(
     stretch: Stretch, tracks: Sequence[Track], track_of_point: Sequence[Instance], space: FreeSpace
-) -> JoinedObjects:
-    """Return the object that each of the K tracks belongs to, and the motion of its points.
+) -> tuple[Int, Int]:
+    """Join the tracks that are pieces of one object.
 
     An object has the number of its track with most points. A track without points is an object of
     its own. ``track_of_point`` holds, for each sweep, (N,) int32: the index of each point's track,
     -1 for static points.
+
+    Returns:
+        For each of the K tracks (K,) the number of its object, and (K,) the index of the track with
+        which its points move.
     """
     pieces = _make_pieces(stretch, tracks, track_of_point, space)
-    object_of_track = np.arange(len(tracks))
-    carrier_of_track = np.arange(len(tracks))
+    object_of_track, carrier_of_track = np.arange(len(tracks)), np.arange(len(tracks))
+    num_points = {k: sum(map(len, piece.points.values())) for k, piece in pieces.items()}
     # The piece with most points starts an object, which takes in pieces until none fits. The larger
     # object may touch further pieces.
-    queue = sorted(pieces, key=lambda k: (-pieces[k].num_points, k))
+    queue = sorted(pieces, key=lambda k: (-num_points[k], k))
     while queue:
         k = queue.pop(0)
         parts = [pieces[k]]
@@ -254,7 +241,7 @@ def join_pieces(
             parts += [pieces[m] for m in new_parts]
             queue = [m for m in queue if m not in new_parts]
             has_grown = bool(new_parts)
-    return JoinedObjects(object_of_track, carrier_of_track)
+    return object_of_track, carrier_of_track
 
 
 def _has_own_motion(piece: _Piece, track: Track, space: FreeSpace) -> bool:
@@ -299,8 +286,11 @@ def _is_part(
         return False
     # Rule 1: the piece touches the object in most common sweeps, and lies in the object's box.
     is_touching = _touches(piece, moving_object, common)
-    if is_touching and _lies_in_box(piece, moving_object, common, middle_s):
-        return True
+    track = moving_object.track
+    if is_touching:
+        moved_with_object = track.place(piece.in_object(track, common), middle_s)
+        if _lies_in_box(moved_with_object, moving_object, middle_s):
+            return True
 
     # The other rules require that the piece moves like the object.
     neighbour_m = float(np.median(np.concatenate([piece.near_m[i] for i in common])))
@@ -308,8 +298,14 @@ def _is_part(
     positions = piece.track.place(piece.in_object(piece.track, common), middle_s)
     compared = [i for i in common if space.clock.near(i, middle, _COMPARED_S)]
     ends_s = space.clock.time_s[[compared[0], compared[-1]]]
-    tracks = piece.track, moving_object.track
-    if not _move_alike(tracks, positions, middle_s, ends_s, tolerance_m):
+    # Both tracks carry the points to nearly the same positions at both ends.
+    drift = [
+        track.carry(positions, middle_s, end_s) - piece.track.carry(positions, middle_s, end_s)
+        for end_s in ends_s
+    ]
+    noise_m = _NUM_SIGMAS * np.hypot(track.path.residual_m, piece.track.path.residual_m)
+    drift_m = np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max()
+    if drift_m > tolerance_m + noise_m:
         return False
     # Rule 2: it also touches the object in most common sweeps.
     if is_touching:
@@ -318,7 +314,7 @@ def _is_part(
     # gap of up to 1.5 m may be a part without returns. Between two vehicles it is seen through.
     gap_m = _gap_in_lane_m(positions, moving_object, middle_s)
     if tolerance_m < gap_m <= _BUMPERS_M:
-        in_object = moving_object.track.undo(positions, middle_s)
+        in_object = track.undo(positions, middle_s)
         return not _is_seen_between(in_object, moving_object, common, space)
     return gap_m <= min(tolerance_m, _BUMPERS_M)
 
@@ -344,45 +340,28 @@ def _touches(piece: _Piece, moving_object: MovingObject, sweeps: Sequence[int]) 
     return bool(np.mean(is_touching) >= _MIN_SHARE)
 
 
-def _lies_in_box(
-    piece: _Piece, moving_object: MovingObject, sweeps: Sequence[int], at_s: float
-) -> bool:
-    """Return True if most points of a piece, moved with an object, are in the object's box."""
-    track, shape = moving_object
-    lane = moving_object.lane(at_s)
-    object_along_m = track.place(shape.points, at_s)[:, :2] @ lane.ahead
-    is_inside = []
-    for i in sweeps:
-        positions = track.place(piece.in_object(track, [i]), at_s)
-        along_m = positions[:, :2] @ lane.ahead
-        is_beside = (along_m >= object_along_m.min()) & (along_m <= object_along_m.max())
-        is_inside.append(lane.holds(positions) & is_beside)
-    return bool(np.concatenate(is_inside).mean() >= _MIN_SHARE)
-
-
-def _move_alike(
-    tracks: tuple[Track, Track], points: Float, at_s: float, ends_s: Float, tolerance_m: float
-) -> bool:
-    """Return True if two tracks carry (N,3) points to nearly the same positions at other times."""
-    track, other_track = tracks
-    drift = [
-        other_track.carry(points, at_s, end_s) - track.carry(points, at_s, end_s)
-        for end_s in ends_s
-    ]
-    noise_m = _NUM_SIGMAS * np.hypot(other_track.path.residual_m, track.path.residual_m)
-    drift_m = np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max()
-    return bool(drift_m <= tolerance_m + noise_m)
+def _lies_in_box(positions: Float, moving_object: MovingObject, at_s: float) -> bool:
+    """Return True if most of (N,3) positions at a time are in the box of an object."""
+    lane, along_m, object_along_m = _along_lane(positions, moving_object, at_s)
+    is_beside = (along_m >= object_along_m.min()) & (along_m <= object_along_m.max())
+    return bool((lane.holds(positions) & is_beside).mean() >= _MIN_SHARE)
 
 
 def _gap_in_lane_m(positions: Float, moving_object: MovingObject, at_s: float) -> float:
     """Return the gap along the lane between an object and (N,3) points, infinite outside it."""
-    track, shape = moving_object
-    lane = moving_object.lane(at_s)
+    lane, along_m, object_along_m = _along_lane(positions, moving_object, at_s)
     if lane.holds(positions).mean() < _MIN_SHARE:
         return np.inf
-    along_m = positions[:, :2] @ lane.ahead
-    object_along_m = track.place(shape.points, at_s)[:, :2] @ lane.ahead
     return float(max(along_m.min() - object_along_m.max(), object_along_m.min() - along_m.max()))
+
+
+def _along_lane(
+    positions: Float, moving_object: MovingObject, at_s: float
+) -> tuple[Lane, Float, Float]:
+    """Return an object's lane, and the coordinates along it of positions and object points."""
+    lane = moving_object.lane(at_s)
+    object_points = moving_object.track.place(moving_object.shape.points, at_s)
+    return lane, positions[:, :2] @ lane.ahead, object_points[:, :2] @ lane.ahead
 
 
 def _is_seen_between(

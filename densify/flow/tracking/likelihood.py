@@ -20,16 +20,12 @@ from densify.flow.tracking.candidates import LINK_M, Obstacles
 from densify.flow.tracking.objects import MovingObject, Track, near_m
 from densify.free_space.range_image import REACH_S, FreeSpace
 from densify.geometry.nearest import is_near, nearest, tree_of
-from densify.geometry.types import Bool, Float
+from densify.geometry.types import Float
 
-_NUM_STATES = 3  # fewer states always lie on a line
-NUM_ASKED = 60
-"""Greatest number of tested points of a batch."""
+NUM_ASKED = 60  # greatest number of tested points of a batch
 _PRIOR_COUNT = 5.0  # added to both counts of a ratio, because few observations are weak evidence
 _CLEARLY = 1.0  # difference of the log odds of two motions that exceeds noise
 _MIN_ROUGHNESS = 0.1  # accuracy of a state, as a share of the neighbour distance
-
-_FILE = Path(__file__).with_name("likelihood.json")
 
 RecordEvidence = Callable[[Track, "Evidence"], None]
 
@@ -39,12 +35,6 @@ class Places(NamedTuple):
 
     num_occupied: int  # number of positions with a return of something else
     num_free: int  # number of positions in observed free space
-
-    def add(self, is_occupied: Bool, is_free: Bool) -> Places:
-        """Return the counts with those of more positions (P,), occupied or free by two masks."""
-        return Places(
-            self.num_occupied + int(is_occupied.sum()), self.num_free + int(is_free.sum())
-        )
 
     def log_occupied(self) -> float:
         """Return the log odds that a position is occupied, near 0 for few observations."""
@@ -104,18 +94,28 @@ class Evidence(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """The log odds that a track moves."""
+    """A track that was tried, and the log odds that it moves."""
 
-    log_odds: float  # log odds that the track moves; above 0 it is confirmed
-    best_log_odds: float  # log odds that the track would have if its motion left no violations
+    track: Track
+    log_odds: float = -np.inf  # log odds that the track moves; above 0 it is confirmed
+    # Log odds that the track would have if its motion left no violations
+    best_log_odds: float = -np.inf
 
     @property
     def moves(self) -> bool:
         """Return True if the track more likely moves than not."""
         return self.log_odds > 0
 
-    def is_clearly_below(self, log_odds: float) -> bool:
-        """Return True if another motion, with these log odds, is clearly more likely."""
+    @property
+    def leaves_much_unexplained(self) -> bool:
+        """Return True if a motion without violations would be clearly more likely."""
+        return self._is_clearly_below(self.best_log_odds)
+
+    def or_better(self, other: Verdict) -> Verdict:
+        """Return the other verdict if its track is clearly more likely, else this one."""
+        return other if self._is_clearly_below(other.log_odds) else self
+
+    def _is_clearly_below(self, log_odds: float) -> bool:
         return log_odds > max(self.log_odds, 0.0) + _CLEARLY
 
 
@@ -126,15 +126,17 @@ def judge(
     objects: Sequence[MovingObject],
     record: RecordEvidence | None = None,
 ) -> Verdict:
-    """Return the log odds that a smoothed track moves, minus infinity below 3 observations.
+    """Return a smoothed track's log odds to move, minus infinity below 3 observations.
 
     Args:
         obstacles: Points above the ground of each sweep of the stretch.
         objects: Objects confirmed so far. Their returns do not count against the track.
         record: Called with the track and its evidence, unless it has fewer than 3 observations.
     """
-    if len(track.observations) < _NUM_STATES:
-        return Verdict(-np.inf, -np.inf)
+    if len(track.observations) < 3:  # fewer states always lie on a line
+        return Verdict(track)
+    path = track.path
+    travel = (path(path.end_s) - path(path.begin_s))[:2]
     violations = count_violations(track, obstacles, space)
     neighbour_m = near_m(space.gap_m(track.centre, next(iter(track.claimed))))
     # Observations at vacated positions cost most time. At first all are assumed to be free, which
@@ -144,9 +146,9 @@ def judge(
         violations=violations,
         before=all_free,
         after=all_free,
-        distance=track.path.travelled_m() / neighbour_m,
-        roughness=track.path.residual_m / neighbour_m,
-        slenderness=_slenderness(track, obstacles, neighbour_m),
+        distance=float(np.linalg.norm(travel)) / neighbour_m,
+        roughness=path.residual_m / neighbour_m,
+        slenderness=_slenderness(track.points_in(obstacles, track.claimed), travel, neighbour_m),
     )
     weights = fitted_weights()
     if record is not None or evidence.log_odds(weights) > 0:
@@ -155,7 +157,7 @@ def judge(
     if record is not None:
         record(track, evidence)
     without_violations = evidence._replace(violations=violations._replace(moved=0))
-    return Verdict(evidence.log_odds(weights), without_violations.log_odds(weights))
+    return Verdict(track, evidence.log_odds(weights), without_violations.log_odds(weights))
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
@@ -196,12 +198,10 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
     return Violations(static, moved, num_tests)
 
 
-def _slenderness(track: Track, obstacles: Sequence[Obstacles], neighbour_m: float) -> float:
-    """Return the extent of the points along their motion divided by their height, at least 1."""
+def _slenderness(points: Float, travel: Float, neighbour_m: float) -> float:
+    """Return the extent of points (N,3) along ``travel`` (2,) divided by their height, or 1."""
     # A long, low guard rail shows no motion along itself, and is seen through between two rings.
-    points = track.points_in(obstacles, track.claimed)
-    motion = (track.path(track.path.end_s) - track.path(track.path.begin_s))[:2]
-    length_m = float(np.ptp(points[:, :2] @ motion)) / max(float(np.hypot(*motion)), 1e-9)
+    length_m = float(np.ptp(points[:, :2] @ travel)) / max(float(np.hypot(*travel)), 1e-9)
     height_m = float(np.ptp(points[:, 2]))
     # The height is known to the neighbour distance only, which also avoids a division by 0.
     return max(1.0, length_m / (height_m + neighbour_m))
@@ -214,18 +214,11 @@ def count_vacated_places(
     objects: Sequence[MovingObject],
     within_m: float,
 ) -> tuple[Places, Places]:
-    """Count what other sweeps observed at an object's positions while it was elsewhere.
+    """Count what other sweeps observed at an object's positions before it came, and after it left.
 
     Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
-    through from some directions only. Its vacated positions then hold returns of the fence.
-
-    Args:
-        obstacles: Points above the ground of each sweep of the stretch.
-        objects: Other confirmed objects. Their returns do not count.
-        within_m: Distance up to which a return occupies a position.
-
-    Returns:
-        The counts before the object's arrival, and after it left.
+    through from some directions only. Its vacated positions then hold returns of the fence. A
+    return within ``within_m`` occupies a position, unless it is of one of the other ``objects``.
     """
     sweeps = list(track.claimed)
     samples = [
@@ -239,7 +232,7 @@ def count_vacated_places(
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     # Positions that the object left longer than `REACH_S` ago do not count.
     reach_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
-    before = after = Places(0, 0)
+    counts = np.zeros((2, 2), int)  # before and after, occupied and free
     for batch in space.batches:
         first, last = batch[0], batch[-1]
         in_object = track.undo(positions, space.clock.time_s[first])
@@ -255,9 +248,10 @@ def count_vacated_places(
         returns = [_returns_near(vacated, within_m, obstacles[j], objects) for j in batch]
         is_occupied = is_near(tree_of(np.concatenate(returns)), vacated, within_m)
         is_free = space.seen_through(vacated, first) & ~is_occupied
-        before = before.add(is_occupied[~is_after], is_free[~is_after])
-        after = after.add(is_occupied[is_after], is_free[is_after])
-    return before, after
+        for row, at_row in enumerate((~is_after, is_after)):
+            counts[row] += is_occupied[at_row].sum(), is_free[at_row].sum()
+    before, after = counts.tolist()
+    return Places(*before), Places(*after)
 
 
 def _returns_near(
@@ -278,4 +272,4 @@ def _returns_near(
 @cache
 def fitted_weights() -> Mapping[str, float]:
     """Return the fitted weight of each term by its name, and the ``price``."""
-    return read_json(_FILE)["weights"]
+    return read_json(Path(__file__).with_name("likelihood.json"))["weights"]

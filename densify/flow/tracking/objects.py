@@ -26,11 +26,9 @@ from densify.geometry.types import Bool, Float, Int
 _KNOT_S = 0.1
 # Weights of the penalty: (noise of a state / (jerk · knot³))², noise 3 cm, jerk 0.03 and 10 m/s³
 _STIFFNESSES = (1e6, 10.0)
-_MAX_ERROR_RATIO = 0.8  # greatest leave-one-out error of a softer path, by that of a stiffer one
 # Fewer states, or a shorter time, determine no acceleration, or no jerk.
 MIN_STATES, _JERK_STATES = 5, 8
 MIN_SPAN_S, _JERK_S = (_KNOT_S * (num - 1.5) for num in (MIN_STATES, _JERK_STATES))
-_DEGREE = 3
 # Powers 3 to 0 of the time since a span began, by the coefficients of the four B-splines on it.
 _CUBIC = np.array([[-1, 3, -3, 1], [3, -6, 3, 0], [-3, 0, 3, 0], [1, 4, 1, 0]]) / 6
 
@@ -49,16 +47,11 @@ class Path:
 
     @staticmethod
     def fit(times_s: Float, states: Float, weights: Float) -> Path:
-        """Fit a path to states, as stiff as the states allow.
+        """Fit a path to states (m,d) at ascending times (m,), as stiff as the states allow.
 
         A softer path is taken only if its leave-one-out error, in closed form, is at least 20 %
         lower. It needs at least 8 states and 0.65 s. Fewer than 5 states, or less than 0.35 s, give
-        a path of almost constant velocity.
-
-        Args:
-            times_s: (m,) ascending times, s.
-            states: (m,d) coordinates at these times, first x and y in metres.
-            weights: (m,) weights of the states, of any scale.
+        a path of almost constant velocity. The weights (m,) of the states are of any scale.
         """
         num_states = len(times_s)
         begin_s, end_s = float(times_s[0]), float(times_s[-1])
@@ -86,8 +79,11 @@ class Path:
             # The diagonal of the map from the states to the fitted states
             leverage = np.einsum("ij,ji->i", basis, fit_matrix)
             deviation_m = np.linalg.norm((states - basis @ trial)[:, :2], axis=1)
-            error_m = _leave_one_out_error_m(deviation_m, leverage, state_weight)
-            if error_m < _MAX_ERROR_RATIO * least_error_m:
+            # RMS deviation of each state from the fit to the other states, without further fits.
+            # Without the limit, a state that alone determines a parameter would give 0 / 0.
+            left_out_m = deviation_m / np.maximum(1 - leverage, 1e-3)
+            error_m = float(np.sqrt(np.average(left_out_m**2, weights=state_weight)))
+            if error_m < 0.8 * least_error_m:
                 # The leverages sum to the number of fitted parameters. Half a degree of freedom
                 # remains at least.
                 freedom = max(num_states - leverage.sum() - 0.5, 0.5)
@@ -100,15 +96,15 @@ class Path:
     @cached_property
     def _pieces(self) -> tuple[Float, Float]:
         """Begins (P,), s, of the pieces of the path, and their cubic polynomials (4,P,d)."""
-        num_spans = len(self.coefficients) - _DEGREE
+        num_spans = len(self.coefficients) - 3
         span_s = (self.end_s - self.begin_s) / num_spans
         # Span k is a cubic polynomial of the coefficients k to k + 3. Its rows are the powers 3 to
         # 0 of the time since the span began, in units of a span.
-        controls = np.stack([self.coefficients[k : k + num_spans] for k in range(_DEGREE + 1)])
+        controls = np.stack([self.coefficients[k : k + num_spans] for k in range(4)])
         spans = np.einsum("pk,knd->pnd", _CUBIC, controls)
         # Outside the spans the path continues as a straight line, a piece at either end.
         linear, constant = 2, 3  # rows of the powers 1 and 0
-        before, after = np.zeros((2, _DEGREE + 1, 1, spans.shape[2]))
+        before, after = np.zeros((2, 4, 1, spans.shape[2]))
         # The piece before begins one span early, hence its value there is one slope lower.
         before[linear] = spans[linear, :1]
         before[constant] = spans[constant, :1] - before[linear]
@@ -117,7 +113,7 @@ class Path:
         after[constant] = spans[:, -1:].sum(axis=0)
         after[linear] = np.arange(3.0, -1.0, -1) @ spans[:, -1]
         # From units of a span to seconds
-        per_second = span_s ** -np.arange(_DEGREE, -1.0, -1)
+        per_second = span_s ** -np.arange(3, -1.0, -1)
         pieces = np.concatenate([before, spans, after], axis=1) * per_second[:, None, None]
         return self.begin_s + span_s * np.arange(-1.0, num_spans + 1), pieces
 
@@ -137,47 +133,28 @@ class Path:
         (cubic, square, linear, _), since_s = self._piece_at(time_s)
         return (3 * cubic * since_s + 2 * square) * since_s + linear
 
-    def travelled_m(self) -> float:
-        """Return the horizontal distance between the first and the last position of the fit."""
-        return float(np.linalg.norm((self(self.end_s) - self(self.begin_s))[:2]))
-
 
 def _basis(at_span: Float, num_spans: int) -> Float:
     """Return the (m,n) values of n = num_spans + 3 B-splines at times (m,) in units of a span."""
     span = np.minimum(at_span.astype(np.int64), num_spans - 1)  # the end is in the last span
-    powers = (at_span - span)[:, None] ** np.arange(_DEGREE, -1, -1)
-    basis = np.zeros((len(at_span), num_spans + _DEGREE))
+    powers = (at_span - span)[:, None] ** np.arange(3, -1, -1)
+    basis = np.zeros((len(at_span), num_spans + 3))
     # The four B-splines that are above 0 on a span have the numbers of the span and the next three.
-    np.put_along_axis(basis, span[:, None] + np.arange(_DEGREE + 1), powers @ _CUBIC, axis=1)
+    np.put_along_axis(basis, span[:, None] + np.arange(4), powers @ _CUBIC, axis=1)
     return basis
 
 
-def _leave_one_out_error_m(deviation_m: Float, leverage: Float, state_weight: Float) -> float:
-    """Return the weighted RMS deviation (m) of each state from the fit to the other states."""
-    # In closed form, without further fits. Without the limit the only state that determines a
-    # parameter (leverage 1) would give 0 / 0.
-    left_out_m = deviation_m / np.maximum(1 - leverage, 1e-3)
-    return float(np.sqrt(np.average(left_out_m**2, weights=state_weight)))
-
-
-# Neighbour distance: least one, for noise and errors of registration, and share of the ring gap
-_NEAR_M, _NEAR_GAPS = 0.2, 0.5
-_MANY_POINTS = 100  # more points do not locate an object better
 BESIDE_M = 1.0  # from a towing vehicle to its trailer, and from an object to the road
 _OUTLINE_M = 0.05  # distance outside an outline that still counts as inside
-LONG_M = 3.0
-"""Objects shorter than this may bend, and need not move where they point."""
-LANE_M = 15.0
-"""Distance ahead of and behind an object within which its parts are searched."""
+LONG_M = 3.0  # objects shorter than this may bend, and need not move where they point
+LANE_M = 15.0  # distance ahead of and behind an object within which its parts are searched
 _SIDE_M = 0.1  # margin of a lane
-_QUARTERS_RAD = np.arange(4) * np.pi / 2
-# Search for the sides: number of points, step of the angle, bins of the histograms
-_SOME_POINTS, _ANGLE_DEG, _BIN_M = 1000, 0.5, 0.05
+_BIN_M = 0.05  # bins of the histograms that show the sides
 
 
 def near_m(gap_m: Float | float) -> Any:
     """Return the neighbour distance (m): half the ring gap ``gap_m``, but at least 0.2 m."""
-    return np.maximum(_NEAR_M, _NEAR_GAPS * gap_m)
+    return np.maximum(0.2, 0.5 * gap_m)  # 0.2 m: noise and errors of registration
 
 
 @dataclass(frozen=True)
@@ -209,14 +186,7 @@ class Track:
     path: Path = field(init=False)
 
     def add(self, n: int, batch: Batch, state: Float, seen_s: float, rows: Int) -> None:
-        """Add the observation in one batch.
-
-        Args:
-            n: Index of the batch.
-            state: (4,) state of the object.
-            seen_s: Mean firing time of the points.
-            rows: Ascending rows of the points in the batch's obstacles.
-        """
+        """Add the observation in batch n: a state (4,), with points at ascending obstacle rows."""
         rows_by_sweep = batch.split(rows)
         self.observations[n] = Observation(state, seen_s, batch.time_ns, tuple(rows_by_sweep))
         self.claimed |= rows_by_sweep
@@ -226,7 +196,8 @@ class Track:
         batches = sorted(self.observations)
         times_s = np.array([self.observations[n].seen_s for n in batches])
         states = np.stack([self.observations[n].state for n in batches])
-        weights = np.array([min(self.num_points(n), _MANY_POINTS) for n in batches], float)
+        # More than 100 points do not locate an object better.
+        weights = np.array([min(self.num_points(n), 100) for n in batches], float)
         self.path = Path.fit(times_s, states, weights)
 
     def place(self, points: Float, time_s: float | Float) -> Float:
@@ -264,12 +235,6 @@ class Track:
         """Return the (N,3) points of the object in some sweeps (by index), object's frame."""
         clouds = (self.in_object(obstacles[j], self.claimed[j]) for j in sweeps)
         return np.concatenate([np.zeros((0, 3)), *clouds])
-
-    def rows_in(self, batch: Batch) -> Int:
-        """Return the indices, in the batch's obstacles, of the object's points."""
-        sweeps = zip(batch.sweeps, batch.begins, strict=True)
-        rows = [self.claimed[j] + begin for j, begin in sweeps if j in self.claimed]
-        return np.concatenate([np.zeros(0, np.int64), *rows])  # the first part: for no rows
 
     def num_points(self, n: int) -> int:
         """Return the number of the object's points in batch index n."""
@@ -336,16 +301,16 @@ class Shape:
         """The direction of one side seen from above, in [0, pi / 2), object's frame."""
         # The sides of a vehicle are parallel or perpendicular. Along the axes of the sides,
         # histograms of the points are most peaked (greatest sum of squares).
-        points = self.points[:: len(self.points) // _SOME_POINTS + 1, :2]
+        points = self.points[:: len(self.points) // 1000 + 1, :2]
         points = points - points.mean(axis=0)
         reach_m = float(np.linalg.norm(points, axis=1).max())
         num_bins = int(2 * reach_m / _BIN_M) + 2  # rounded up, and one bin for the end itself
-        angles = np.deg2rad(np.arange(0.0, 90.0, _ANGLE_DEG))
+        angles = np.deg2rad(np.arange(0.0, 90.0, 0.5))
         score = np.zeros(len(angles))
         for axis_rad in (angles, angles + np.pi / 2):
-            x_m = np.outer(np.cos(axis_rad), points[:, 0])
-            y_m = np.outer(np.sin(axis_rad), points[:, 1])
-            along_m = x_m + y_m  # (angles, points) coordinates along the axis
+            # (angles, points) coordinates along the axis
+            along_m = np.outer(np.cos(axis_rad), points[:, 0])
+            along_m += np.outer(np.sin(axis_rad), points[:, 1])
             bin_number = ((along_m + reach_m) / _BIN_M).astype(np.int64)
             # Each angle has bins of its own. One count gives the histograms of all angles.
             bin_number += num_bins * np.arange(len(angles))[:, None]
@@ -384,7 +349,7 @@ class MovingObject(NamedTuple):
         if np.linalg.norm(np.ptp(rim, axis=0)) < LONG_M:
             return direction
         yaw_rad = float(self.track.path(at_s)[3])
-        sides_rad = self.shape.side_rad + yaw_rad + _QUARTERS_RAD
+        sides_rad = self.shape.side_rad + yaw_rad + np.arange(4) * np.pi / 2
         sides = np.stack([np.cos(sides_rad), np.sin(sides_rad)], axis=1)
         side: Float = sides[np.argmax(sides @ direction)]
         return side if np.ptp(rim @ side) >= LONG_M else direction
@@ -394,12 +359,8 @@ class MovingObject(NamedTuple):
         ahead = self.heading(at_s)
         rim = self.track.place(self.shape.rim, at_s)
         aside_m = rim[:, :2] @ [-ahead[1], ahead[0]]
-        return Lane(
-            ahead=ahead,
-            right_m=aside_m.min() - _SIDE_M,
-            left_m=aside_m.max() + _SIDE_M,
-            top_m=rim[:, 2].max() + _SIDE_M,
-        )
+        right_m, left_m = aside_m.min() - _SIDE_M, aside_m.max() + _SIDE_M
+        return Lane(ahead, right_m, left_m, top_m=rim[:, 2].max() + _SIDE_M)
 
 
 class Lane(NamedTuple):

@@ -16,9 +16,10 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
 
+from densify.flow.graph import knn_graph
 from densify.flow.tracking.following import FIT_M
 from densify.flow.tracking.objects import LONG_M, MIN_SPAN_S, MIN_STATES
-from densify.geometry.nearest import nearest, nearest_k, tree_of
+from densify.geometry.nearest import nearest, nearest_k, thinned, tree_of
 from densify.geometry.types import Float, Int
 
 # Levels from stiff to soft: weight of smoothness, greatest distance of a target that pulls, and
@@ -28,15 +29,9 @@ _REACHES_M = np.geomspace(0.5, 0.25, len(_ALPHAS))
 _BLURS_M = np.geomspace(0.2, 0.08, len(_ALPHAS))
 # One node per voxel: otherwise dense regions would be stiffer than sparse regions.
 _NODE_M = 0.07
-_NUM_NEIGHBORS, _LINK_M = 6, 0.5  # neighbours in the graph of nodes, and their greatest distance
 _NUM_BLURRED = 8  # neighbours that are averaged by a blur
 _ANCHOR, _ANCHOR_M = 2.0, 0.02  # weight of the rigid position, and distance at which it fades
 _MAX_PRODUCTS, _RESIDUAL_DROP = 30, 0.02  # limits of the linear solver
-_NUM_INTERPOLATED = 3  # points that a value is interpolated from
-_MIN_POINTS = 20  # least median number of points of a snapshot
-# A softer object must lower the squared distance by this share, and in this share of snapshots. On
-# eight streets parts of vehicles gained up to 0.045, walkers within 20 m mostly 0.06 to 0.4.
-_MIN_GAIN, _MIN_SHARE_BETTER = 0.05, 0.75
 
 
 @dataclass(frozen=True)
@@ -52,11 +47,9 @@ class Softened:
     """How an object bends from sweep to sweep; its points in one sweep are a `Snapshot`."""
 
     snapshots: tuple[Snapshot, ...]  # points of the object in each sweep, by ascending time
-    # For each snapshot (n,3) metres, displacement of its points to the time of the next snapshot
-    # relative to the rigid motion, object's frame; 0 for the last snapshot and for a rigid object
-    to_next: tuple[Float, ...]
-    # As ``to_next``, to the time of the previous snapshot; 0 for the first snapshot
-    to_previous: tuple[Float, ...]
+    # Hop (a, b), from a snapshot to the next or previous one: (n,3) metres, displacement of the
+    # points of a to the time of b relative to the rigid motion, object's frame; empty for rigid
+    hops: dict[tuple[int, int], Float]
     # Weight of smoothness (stiffness) that held-out snapshots confirmed, inf for rigid
     alpha: float
     # Root mean square distance of held-out snapshots from their prediction, by the alpha tried,
@@ -68,10 +61,10 @@ class Softened:
         # The mean of the velocities to the next and from the previous snapshot. On the way to the
         # previous one both the displacement and the duration change their sign.
         velocities = []
-        for j, displacement in ((i + 1, self.to_next[i]), (i - 1, self.to_previous[i])):
-            if 0 <= j < len(self.snapshots):
+        for j in (i + 1, i - 1):
+            if (i, j) in self.hops:
                 duration_s = self.snapshots[j].time_s - self.snapshots[i].time_s
-                velocities.append(displacement / duration_s)
+                velocities.append(self.hops[i, j] / duration_s)
         if not velocities:
             return np.zeros_like(self.snapshots[i].points)
         return np.asarray(np.mean(velocities, axis=0))
@@ -81,17 +74,16 @@ class Softened:
         points = self.snapshots[i].points
         if i == j or np.isinf(self.alpha):
             return points
-        if j > i:
-            step, onward, back = 1, self.to_next, self.to_previous
-        else:
-            step, onward, back = -1, self.to_previous, self.to_next
+        step = 1 if j > i else -1
         # At each snapshot in between, a point continues like the nearby points of that snapshot
         # which arrived by a similar displacement: a hand that passes the hip moves on as a hand.
-        displacement = onward[i]
+        displacement = self.hops[i, i + step]
         for k in range(i + step, j, step):
             points = points + displacement
-            snapshot_points = self.snapshots[k].points
-            displacement = _interpolate(points, displacement, snapshot_points, -back[k], onward[k])
+            arrived_by, onward = -self.hops[k, k - step], self.hops[k, k + step]
+            displacement = _interpolate(
+                points, displacement, self.snapshots[k].points, arrived_by, onward
+            )
         return points + displacement
 
 
@@ -104,33 +96,32 @@ def soften(snapshots: Sequence[Snapshot]) -> Softened:
     5 snapshots, within less than 0.35 s, or with a median of fewer than 20 points stay rigid.
     """
     snapshots = tuple(snapshots)
-    zero = tuple(np.zeros_like(snapshot.points) for snapshot in snapshots)
     if not _may_bend(snapshots):
-        return Softened(snapshots, zero, zero, np.inf, {})
+        return Softened(snapshots, {}, np.inf, {})
     squared_m2 = _held_out_errors(snapshots)
     rms_m = np.sqrt(squared_m2.mean(axis=0)).tolist()
     held_out_m = dict(zip((np.inf, *_ALPHAS), rms_m, strict=True))
     rigid_m2 = squared_m2[:, 0]
-    is_clearly_better = squared_m2.mean(axis=0) < (1 - _MIN_GAIN) * rigid_m2.mean()
-    is_mostly_better = (squared_m2 < squared_m2[:, :1]).mean(axis=0) >= _MIN_SHARE_BETTER
+    # On eight streets parts of vehicles gained up to 4.5 %, walkers within 20 m mostly 6 to 40 %.
+    is_clearly_better = squared_m2.mean(axis=0) < 0.95 * rigid_m2.mean()
+    is_mostly_better = (squared_m2 < squared_m2[:, :1]).mean(axis=0) >= 0.75
     confirmed = np.flatnonzero(is_clearly_better & is_mostly_better)
     if not len(confirmed):
-        return Softened(snapshots, zero, zero, np.inf, held_out_m)
+        return Softened(snapshots, {}, np.inf, held_out_m)
     softest = int(confirmed[-1]) - 1  # column 0 is the rigid object
     # Again with all snapshots, from the stiffest level down to the confirmed one
     bending = _FlowSolver(snapshots)
     for k in range(softest + 1):
         bending.fill_targets()
         bending.refine(k)
-    to_next, to_previous = _average_with_reverse(snapshots, *bending.at_points())
-    return Softened(snapshots, to_next, to_previous, _ALPHAS[softest], held_out_m)
+    return Softened(snapshots, bending.at_points(), _ALPHAS[softest], held_out_m)
 
 
 def _may_bend(snapshots: tuple[Snapshot, ...]) -> bool:
     """Return True if the object is shorter than 3 m and was observed often enough."""
     if len(snapshots) < MIN_STATES or snapshots[-1].time_s - snapshots[0].time_s < MIN_SPAN_S:
         return False
-    if np.median([len(snapshot.points) for snapshot in snapshots]) < _MIN_POINTS:
+    if np.median([len(snapshot.points) for snapshot in snapshots]) < 20:
         return False
     lengths_m = [np.linalg.norm(np.ptp(snapshot.points, axis=0)) for snapshot in snapshots]
     return bool(np.median(lengths_m) < LONG_M)
@@ -167,7 +158,10 @@ class _FlowSolver:
 
     def __init__(self, snapshots: tuple[Snapshot, ...]) -> None:
         self._snapshots = snapshots
-        self._nodes = [snapshot.points[_one_per_voxel(snapshot.points)] for snapshot in snapshots]
+        self._nodes = [
+            points[thinned(points, np.arange(len(points)), _NODE_M, 1)]
+            for points in (snapshot.points for snapshot in snapshots)
+        ]
         # A hop (a, b) leads from snapshot a to the next or the previous snapshot b.
         last = len(snapshots) - 1
         self._hops = [(a, a + 1) for a in range(last)] + [(a, a - 1) for a in range(1, last + 1)]
@@ -181,7 +175,9 @@ class _FlowSolver:
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
         self._flow = np.zeros_like(self._source)  # (nodes, 3) relative to the rigid motion
         # These depend on the source nodes only, and serve all levels.
-        self._laplacian = _laplacian(self._source)
+        weights = knn_graph(self._source, num_neighbors=6, within_m=0.5)
+        degree = weights.sum(axis=1)
+        self._laplacian = csr_array((diags_array(degree) - weights) / degree.mean())
         self._neighbours = nearest_k(tree_of(self._source), self._source, _NUM_BLURRED)[1]
         self._velocity_penalty = self._velocity_penalty_matrix()
 
@@ -240,18 +236,21 @@ class _FlowSolver:
         later = self._nodes[i + 1] + (1 - share) * flows[i + 1, i]
         return np.concatenate([earlier, later])
 
-    def at_points(self) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-        """Return the flow (n,3) of each snapshot's points to the next and the previous one."""
-        to_next = [np.zeros_like(snapshot.points) for snapshot in self._snapshots]
-        to_previous = [np.zeros_like(snapshot.points) for snapshot in self._snapshots]
+    def at_points(self) -> dict[tuple[int, int], Float]:
+        """Return the flow (n,3) of the points of each hop."""
+        points = [snapshot.points for snapshot in self._snapshots]
+        flows = {}
         for (a, b), flow in self._by_hop().items():
-            nodes = self._nodes[a]
-            points = self._snapshots[a].points
             # With equal displacements, 0, the nearest nodes are chosen by position alone.
-            zero, node_zero = np.zeros_like(points), np.zeros_like(nodes)
-            flows = to_next if b > a else to_previous
-            flows[a] = _interpolate(points, zero, nodes, node_zero, flow)
-        return tuple(to_next), tuple(to_previous)
+            zero, node_zero = np.zeros_like(points[a]), np.zeros_like(self._nodes[a])
+            flows[a, b] = _interpolate(points[a], zero, self._nodes[a], node_zero, flow)
+        # Each flow is averaged with the reversed flow of the points where it arrives.
+        averaged = {}
+        for (a, b), flow in flows.items():
+            reverse = -flows[b, a]
+            reversed_flow = _interpolate(points[a] + flow, flow, points[b], reverse, reverse)
+            averaged[a, b] = (flow + reversed_flow) / 2
+        return averaged
 
     def _by_hop(self) -> dict[tuple[int, int], Float]:
         """Return the flow (n,3) of the nodes of each hop."""
@@ -292,43 +291,6 @@ class _FlowSolver:
         return csr_array(diags_array(diagonal) + mixed)
 
 
-def _laplacian(points: Float) -> csr_array:
-    """Return the (n,n) Laplacian ``(D - W) / mean(D)`` of the neighbour graph of points (n,3)."""
-    # W[i, j] = exp(-|p_i - p_j|² / 1 m²) where either is among the 6 nearest of the other
-    n = len(points)
-    # + 1: each point is its own nearest point
-    distance_m, neighbours = nearest_k(tree_of(points), points, _NUM_NEIGHBORS + 1)
-    row, rank = np.nonzero(distance_m <= _LINK_M)
-    weights = coo_array(
-        (np.exp(-(distance_m[row, rank] ** 2)), (row, neighbours[row, rank])), shape=(n, n)
-    ).tocsr()
-    weights = weights.maximum(weights.T)
-    degree = weights.sum(axis=1)
-    return csr_array((diags_array(degree) - weights) / degree.mean())
-
-
-def _average_with_reverse(
-    snapshots: tuple[Snapshot, ...], to_next: tuple[Float, ...], to_previous: tuple[Float, ...]
-) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """Return both flows, each averaged with the reversed flow of the points where it arrives."""
-
-    def average(a: int, b: int, flow: Float, reverse: Float) -> Float:
-        arrived = snapshots[a].points + flow
-        reversed_flow = _interpolate(arrived, flow, snapshots[b].points, -reverse, -reverse)
-        return (flow + reversed_flow) / 2
-
-    last = len(snapshots) - 1  # without a next snapshot; the first one has no previous snapshot
-    forth = [average(i, i + 1, to_next[i], to_previous[i + 1]) for i in range(last)]
-    back = [average(i + 1, i, to_previous[i + 1], to_next[i]) for i in range(last)]
-    return (*forth, to_next[last]), (to_previous[0], *back)
-
-
-def _one_per_voxel(points: Float) -> Int:
-    """Return the ascending rows of the first point in each voxel of 0.07 m."""
-    voxel = np.floor((points - points.min(axis=0)) / _NODE_M).astype(np.int64)
-    return np.sort(np.unique(voxel, axis=0, return_index=True)[1]).astype(np.int64)
-
-
 def _blur(points: Float, neighbours: Int, positions: Float, blur_m: float) -> tuple[Float, Float]:
     """Return (N,3) Gaussian means of each position's neighbours, and (N,) nearest distances."""
     neighbour_points = points[neighbours]
@@ -351,7 +313,7 @@ def _interpolate(
     """Return (N,3) values at points from (M,3) samples of similar position and displacement."""
     samples = np.hstack([sample_points, sample_displacement])
     queries = np.hstack([points, displacement])
-    neighbours = nearest_k(tree_of(samples), queries, _NUM_INTERPOLATED)[1]
+    neighbours = nearest_k(tree_of(samples), queries, 3)[1]
     distance_m = np.linalg.norm(samples[neighbours] - queries[:, None], axis=2)
     weight = 1 / (distance_m + 1e-3) ** 2
     weight /= weight.sum(axis=1, keepdims=True)

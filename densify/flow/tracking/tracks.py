@@ -7,16 +7,15 @@ both ways. It is confirmed only if its smooth motion explains the measurements.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
 from densify.flow.surface_matching import Model
 from densify.flow.tracking.candidates import LINK_M, Batch, Obstacles
-from densify.flow.tracking.extent import NUM_COLUMNS, columns_apart_m
+from densify.flow.tracking.extent import two_columns_m
 from densify.flow.tracking.following import (
     FIT_M,
     MIN_POINTS,
@@ -24,23 +23,21 @@ from densify.flow.tracking.following import (
     DistanceField,
     Follower,
     Group,
-    find_nearby_velocities,
     find_starts,
     vote,
 )
 from densify.flow.tracking.likelihood import NUM_ASKED, RecordEvidence, Verdict, judge
-from densify.flow.tracking.objects import LANE_M, Lane, MovingObject, Shape, Track
+from densify.flow.tracking.objects import BESIDE_M, LANE_M, Lane, MovingObject, Shape, Track
 from densify.free_space.ground import HeightMap
 from densify.free_space.range_image import FreeSpace
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.clock import Clock
-from densify.geometry.nearest import link
+from densify.geometry.nearest import is_near, link, tree_of
 from densify.geometry.types import Bool, Float, Int
 
 _NEAR_S = 0.3  # greatest time to the sweeps that test a motion
 _PATH_STD = PREDICTION_STD / 2  # standard deviation (m, m, rad) of a smooth path
-_KEPT_SHARE = 0.9  # share of the first track's points that a restarted track must keep
 _GAPS_IN_LANE_M = (1.5, 4.0)  # least and greatest gap that is linked along the heading
 _ONE_RING, _ONE_COLUMN = 0.5, 2.5  # spread of a single ring or column, in steps
 
@@ -63,22 +60,6 @@ def find_tracks(
     return _Search(obstacles, space, ground, velocities_m_s, record).find_tracks()
 
 
-class _Trial(NamedTuple):
-    """A track that was tried, and its verdict."""
-
-    track: Track
-    verdict: Verdict
-
-    @property
-    def leaves_much_unexplained(self) -> bool:
-        """True if a motion without violations would be clearly more likely."""
-        return self.verdict.is_clearly_below(self.verdict.best_log_odds)
-
-    def or_better(self, other_trial: _Trial) -> _Trial:
-        """Return the other trial if it is clearly more likely, else this one."""
-        return other_trial if self.verdict.is_clearly_below(other_trial.verdict.log_odds) else self
-
-
 class _Search:
     """State of the search: batches, points free until a track claims them, and objects found."""
 
@@ -98,24 +79,20 @@ class _Search:
         self.batches = [Batch.of(sweeps, obstacles, space.clock) for sweeps in space.batches]
         self.clock = Clock(np.array([batch.time_ns for batch in self.batches]))
         # For each sweep (C,) True for obstacles that no track has claimed
-        self._free = self._all_obstacles()
+        self._free = [np.ones(len(sweep.points), bool) for sweep in obstacles]
         self._objects = list[MovingObject]()
         self._follower = Follower(self.batches, self._free, ground, self.clock)
+        # For each batch, the fields of its sweeps with candidates
         self._fields: list[list[DistanceField]] = []
-        if velocities_m_s is None:
-            sweep_fields = [
-                DistanceField.of(sweep.points[sweep.candidate], sweep.time_s[sweep.candidate])
-                for sweep in obstacles
-            ]
-            self._fields = [[sweep_fields[j] for j in batch.sweeps] for batch in self.batches]
-
-    def _all_obstacles(self) -> list[Bool]:
-        """Return, for each sweep, a mask (C,) of all obstacles."""
-        return [np.ones(len(sweep.points), bool) for sweep in self._obstacles]
+        for batch in self.batches if velocities_m_s is None else ():
+            sweeps = [obstacles[j] for j in batch.sweeps if obstacles[j].candidate.any()]
+            self._fields.append(
+                [DistanceField.of(s.points[s.candidate], s.time_s[s.candidate]) for s in sweeps]
+            )
 
     def find_tracks(self) -> list[Track]:
         """Return the confirmed tracks; tracks from the best starting clusters come first."""
-        is_untried = self._all_obstacles()
+        is_untried = [np.ones(len(sweep.points), bool) for sweep in self._obstacles]
         for n, cluster in find_starts([batch.obstacles for batch in self.batches], self.clock):
             # Points of an earlier track, confirmed or rejected, start no other track.
             batch = self.batches[n]
@@ -123,18 +100,15 @@ class _Search:
             members = cluster[is_available]
             if len(members) < MIN_POINTS:
                 continue
-            velocities = [
-                velocity
-                for velocity in self._starting_velocities(members, n)
-                if self._may_move(members, n, velocity)
-            ]
+            starting = [self._likely_velocity(members, n), *self._nearby_velocities(members, n)]
+            velocities = [v for v in starting if self._may_move(members, n, v)]
             if not velocities:
                 continue
-            track, verdict = self._track_of(members, n, velocities)
-            for j, rows in track.claimed.items():
+            verdict = self._track_of(members, n, velocities)
+            for j, rows in verdict.track.claimed.items():
                 is_untried[j][rows] = False
             if verdict.moves:
-                self._confirm(track)
+                self._confirm(verdict.track)
         return [track for track, _ in self._objects]
 
     def _confirm(self, track: Track) -> None:
@@ -146,10 +120,19 @@ class _Search:
             self._free[j][rows] = False
         self._objects.append(MovingObject(track, self._shape_of(track)))
 
-    def _starting_velocities(self, members: Int, n: int) -> list[Float]:
-        """Return velocities (3,), m/s, at which batch n's obstacles ``members`` may move."""
-        beside = find_nearby_velocities(self.batches[n], members, self._objects)
-        return [self._likely_velocity(members, n), *beside]
+    def _nearby_velocities(self, members: Int, n: int) -> Iterator[Float]:
+        """Yield the velocity (3,), m/s, of each object within 1 m of batch n's ``members``."""
+        # A trailer has the velocity of the car that tows it. The measurements alone hardly show how
+        # fast a long flat side moves along itself.
+        points = self.batches[n].obstacles.points[members]
+        tree = tree_of(points)
+        for moving_object in self._objects:
+            track = moving_object.track
+            at_s = track.seen_at(self.batches[n].time_ns)
+            if moving_object.may_be_near(points, at_s, BESIDE_M):
+                object_points = track.place(moving_object.shape.points, at_s)
+                if is_near(tree, object_points, BESIDE_M).any():
+                    yield track.velocity_m_s(points.mean(0, keepdims=True), at_s)[0]
 
     def _shape_of(self, track: Track) -> Shape:
         """Return the shape of all points that a track has claimed."""
@@ -182,37 +165,39 @@ class _Search:
         # Points that no sweep saw through, moved or static, may move: nothing speaks against it.
         return num_moved < num_static or num_moved == num_static == 0
 
-    def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> _Trial:
+    def _track_of(self, members: Int, n: int, velocities: Sequence[Float]) -> Verdict:
         """Return the most likely track of ``members`` of batch n's obstacles."""
         best = self._follow(members, n, velocities[0])
         for velocity in velocities[1:]:
             if best.leaves_much_unexplained:
                 best = best.or_better(self._follow(members, n, velocity))
-        if best.verdict.moves and best.leaves_much_unexplained:
+        if best.moves and best.leaves_much_unexplained:
             return self._restart_from_ends(best, n)
         return best
 
-    def _restart_from_ends(self, trial: _Trial, n: int) -> _Trial:
+    def _restart_from_ends(self, best: Verdict, n: int) -> Verdict:
         """Return the most likely of a track and its restarts from the first and last batch."""
         # A track that started at batch n from one flat side may have a wrong speed along that side.
         # In the first or the last batch, another side may be in view.
-        best = trial
-        track = trial.track
+        track = best.track
         for end in sorted({min(track.observations), max(track.observations)} - {n}):
-            rows = track.rows_in(self.batches[end])
+            batch = self.batches[end]
+            sweeps = zip(batch.sweeps, batch.begins, strict=True)
+            rows = np.concatenate(
+                [track.claimed[j] + begin for j, begin in sweeps if j in track.claimed]
+            )
             if len(rows) >= MIN_POINTS:
                 restarted = self._follow(rows, end, self._likely_velocity(rows, end))
-                if restarted.track.total_points() >= _KEPT_SHARE * track.total_points():
+                if restarted.track.total_points() >= 0.9 * track.total_points():
                     best = best.or_better(restarted)
         return best
 
-    def _follow(self, members: Int, n: int, velocity: Float) -> _Trial:
+    def _follow(self, members: Int, n: int, velocity: Float) -> Verdict:
         """Return the track of ``members`` of batch n's obstacles from a velocity (3,), m/s."""
         track = self._follower.follow(members, n, velocity)
         if len(track.observations) > 1:
             track.smooth()
-        verdict = judge(track, self._obstacles, self._space, self._objects, self._record)
-        return _Trial(track, verdict)
+        return judge(track, self._obstacles, self._space, self._objects, self._record)
 
     def _claim_nearby(self, track: Track) -> None:
         """Claim free candidates in or near the object that its motion explains, in place."""
@@ -241,8 +226,8 @@ class _Search:
             clouds.append(track.place(track.in_object(self._obstacles[j], rows), at_s))
 
         T_lidar_world = space.T_lidar_world[next(iter(track.claimed))]
-        columns_m = columns_apart_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
-        gap_m = float(np.clip(NUM_COLUMNS * columns_m, *_GAPS_IN_LANE_M))
+        columns_m = two_columns_m(track.centre, lane.ahead, T_lidar_world, space.sensors)
+        gap_m = float(np.clip(columns_m, *_GAPS_IN_LANE_M))
         # `link` joins points within `LINK_M`. Compressed along the heading by this ratio, points
         # with gaps up to ``gap_m`` are linked too.
         points = np.concatenate(clouds)
