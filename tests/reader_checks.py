@@ -89,6 +89,23 @@ def check_cameras(
                 assert np.abs(got.astype(int) - expected).mean() < 4
 
 
+def check_image_poses(
+    sequence: LidarSequence,
+    excerpt: Excerpt,
+    atol: float,
+    names: Mapping[str, str] | None = None,
+) -> None:
+    """The pose of a camera at each exposure; names as in `check_cameras`."""
+    street = excerpt.street
+    for name in excerpt.cameras:
+        T_lidar_cam = inverse(street.cameras[name].T_cam_lidar)
+        for number, image in enumerate(excerpt.image_numbers(name)):
+            exposed_ns = street.image_stamps_ns(name)[image]
+            expected = street.simulator.T_world_lidar_at(exposed_ns) @ T_lidar_cam
+            read = sequence.T_world_cam((names or {}).get(name, name), number)
+            np.testing.assert_allclose(read, expected, atol=atol)
+
+
 def check_truth(sequence: LidarSequence, excerpt: Excerpt) -> None:
     """The truth beside the data belongs to its rows."""
     truth = sequence.truth

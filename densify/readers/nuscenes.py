@@ -219,9 +219,7 @@ def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseT
     return records, PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
 
 
-def _channels(
-    tables: Path, records: Sequence[Record]
-) -> dict[str, dict[str, dict[int, Datum]]]:
+def _channels(tables: Path, records: Sequence[Record]) -> dict[str, dict[str, dict[int, Datum]]]:
     """Return sweeps and images by modality, channel and number; ``records`` ascend in time."""
     path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
