@@ -218,8 +218,11 @@ def _report_offset(
         text = f"right within {_OFF_DEG} deg: {text}"
     if len(explanations) > 1:
         text += f"; more changes at once fit about equally: {'; or '.join(explanations[1:])}"
-    name = f"{camera.name}: calibration"
-    return finding(name, verdict, text, _corrected_line(camera, fit), **values)
+    # Angles that are 0 within two standard errors are left as they are.
+    corrected = turned(camera, np.where(np.abs(fit.offset) > 2 * fit.error, fit.offset, 0.0))
+    where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
+    remedy = f"T_cam_lidar: {corrected.T_cam_lidar[:3].round(5).tolist()}  # {where}"
+    return finding(f"{camera.name}: calibration", verdict, text, remedy, **values)
 
 
 def _best_mistake(camera: Camera, views: list[View]) -> tuple[str, float]:
@@ -250,14 +253,6 @@ def _explanation(offset: Float) -> str:
         for turn, directions in zip(offset, _DIRECTIONS, strict=False)
     ]
     return f"{', '.join(turns)} and images {1e3 * offset[3]:+.0f} ms late"
-
-
-def _corrected_line(camera: Camera, fit: Fit) -> str:
-    """Return the corrected line. Angles that are 0 within two standard errors are left."""
-    offset = np.where(np.abs(fit.offset) > 2 * fit.error, fit.offset, 0.0)
-    rows = turned(camera, offset).T_cam_lidar[:3].round(5).tolist()
-    where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
-    return f"T_cam_lidar: {rows}  # {where}"
 
 
 def _check_clock(camera: Camera, fit: Fit, num_images: int) -> Finding:

@@ -14,7 +14,7 @@ from densify.free_space.raw_sweeps import (
     lost_deg,
 )
 from densify.geometry.types import Float, Sweep
-from densify.readers.timeline import Timeline, format_frames
+from densify.readers.timeline import format_frames
 
 _SHORT = 0.3  # a file below this share of the usual size is short
 _FETCH = "fetch these files again; windows end before sweeps that cannot be read"
@@ -106,24 +106,18 @@ def check_stamps(sample: Sample) -> list[Finding]:
         )
         remedy = "sort the sweeps by their stamps, or correct the file of stamps"
         return [finding("stamps", WRONG, text, remedy, num_backward=len(backward))]
-    return [_check_rate(timeline.period_ns * 1e-9), *_check_holes(timeline)]
-
-
-def _check_holes(timeline: Timeline) -> list[Finding]:
-    """Report holes in time between sweeps, if there are any."""
-    frames = timeline.frames
-    step_ns = np.diff(timeline.stamp_ns)
+    findings = [_check_rate(timeline.period_ns * 1e-9)]
     holes = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
-    if not len(holes):
-        return []
-    longest = int(holes[np.argmax(step_ns[holes])])
-    text = (
-        f"{len(holes)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
-        f"s after frame {frames[longest]}; windows end there (after frames "
-        f"{format_frames(frames[row] for row in holes)})"
-    )
-    remedy = "nothing, if the sweeps were never recorded; else fetch them again"
-    return [finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(holes))]
+    if len(holes):
+        longest = int(holes[np.argmax(step_ns[holes])])
+        text = (
+            f"{len(holes)} of more than three periods, the longest of "
+            f"{step_ns[longest] * 1e-9:.1f} s after frame {frames[longest]}; windows end there "
+            f"(after frames {format_frames(frames[row] for row in holes)})"
+        )
+        remedy = "nothing, if the sweeps were never recorded; else fetch them again"
+        findings.append(finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(holes)))
+    return findings
 
 
 def _check_rate(period_s: float) -> Finding:
@@ -132,15 +126,12 @@ def _check_rate(period_s: float) -> Finding:
     if least_s <= period_s <= most_s:
         return finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", period_s=period_s)
     text = f"from sweep to sweep {period_s:.3g} s pass, expected {least_s} to {most_s} s"
-    mistakes = [
-        mistake
-        for mistake, factor in _STAMP_UNITS.items()
-        if least_s <= period_s * factor <= most_s
-    ]
-    if mistakes:
-        rate_hz = 1 / (period_s * _STAMP_UNITS[mistakes[0]])
-        text += f"; it would be {rate_hz:.1f} Hz with {mistakes[0]}"
-    verdict = WRONG if mistakes else SUSPICIOUS
+    verdict = SUSPICIOUS
+    for mistake, factor in _STAMP_UNITS.items():
+        if least_s <= period_s * factor <= most_s:
+            verdict = WRONG
+            text += f"; it would be {1 / (period_s * factor):.1f} Hz with {mistake}"
+            break
     return finding("stamps", verdict, text, "correct the unit of the stamps", period_s=period_s)
 
 
@@ -155,26 +146,24 @@ def check_point_times(sample: Sample) -> list[Finding]:
 
 def _check_point_times_of(sample: Sample, lidar: int) -> Finding:
     """Check the firing times of one scanner."""
-    period_s = sample.timeline.period_ns * 1e-9
-    offsets_s = [
-        sweep.offset_ns[sweep.lidar == lidar] * 1e-9
-        for sweep in sample.middles
-        if sweep.offset_ns is not None
-    ]
-    # The first and the last 0.1 % may be stray.
-    ends_s = [np.percentile(offset_s, [0.1, 99.9]) for offset_s in offsets_s if len(offset_s)]
+    ends_s = []
+    for sweep in sample.middles:
+        is_of_lidar = sweep.lidar == lidar
+        if sweep.offset_ns is not None and is_of_lidar.any():
+            # The first and the last 0.1 % may be stray.
+            ends_s.append(np.percentile(sweep.offset_ns[is_of_lidar] * 1e-9, [0.1, 99.9]))
     low_s, high_s = np.median(ends_s, axis=0).tolist()
-    span = (high_s - low_s) / period_s
-    share_before = -low_s / max(high_s - low_s, 1e-12)
+    span_s = high_s - low_s
+    span = span_s / (sample.timeline.period_ns * 1e-9)
     text = (
         f"{low_s * 1e3:+.1f} to {high_s * 1e3:+.1f} ms around the stamp, {span:.3g} periods; "
-        f"the stamp is at {round(100 * share_before)} % of the sweep"
+        f"the stamp is at {round(100 * -low_s / max(span_s, 1e-12))} % of the sweep"
     )
     verdict = SUSPICIOUS
     remedy = "compare the point times with the scanner's rate"
     if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
         verdict = FINE
-    elif span < 1 and _TURN_S[0] <= high_s - low_s <= _TURN_S[1]:
+    elif span < 1 and _TURN_S[0] <= span_s <= _TURN_S[1]:
         verdict = FINE
         text += f"; one of {round(1 / span)} turns of the scanner was kept"
     elif not _WRONG_SPAN[0] <= span <= _WRONG_SPAN[1]:
@@ -201,18 +190,17 @@ def check_units(sample: Sample) -> list[Finding]:
         unit for unit, factor in _LENGTH_UNITS.items() if least_m <= range_m * factor <= most_m
     ]
     text = f"half of the returns are farther than {range_m:.4g} m"
-    verdict = SUSPICIOUS
+    verdict = WRONG
     remedy = "scale the points to metres (sweeps: scale_m in densify.yaml)"
     if least_m <= spread_m <= most_m and range_m > _FAR_OFF * spread_m:
         text += f", and within {spread_m:.1f} m of each other's middle, as if they were in a map's"
         text += " coordinates"
-        verdict = WRONG
         remedy = MAP_FRAME_REMEDY
+    elif units:
+        text += f", expected {least_m} to {most_m:.0f} m, as if they were in {units[0]}"
     else:
         text += f", expected {least_m} to {most_m:.0f} m"
-        if units:
-            verdict = WRONG
-            text += f", as if they were in {units[0]}"
+        verdict = SUSPICIOUS
     return [finding(name, verdict, text, remedy, median_range_m=range_m)]
 
 

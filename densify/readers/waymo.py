@@ -72,10 +72,7 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns (N,) of a component by short name.
-
-        ``kinds`` (by short name) and ``where`` (by full name) are as in `read_arrow`.
-        """
+        """Return columns (N,) by short name; ``kinds`` and ``where`` are as in `read_arrow`."""
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -160,13 +157,12 @@ def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]
         if (frame := frame_of_start.get(int(us))) is not None:
             pose_s, shutter_s, trigger_s, done_s = map(float, times_s)
             name = dict(enumerate(CAMERAS, 1))[int(camera)]
+            where = f"{segment.file('camera_image')}: {name}, frame {frame}"
             images_of_camera[name][frame] = Image(
                 pose_ns=_whole_us(pose_s),
                 exposed_ns=_whole_us((trigger_s + done_s) / 2),
                 readout_s=max(done_s - trigger_s - shutter_s, 0.0),
-                T_world_vehicle=checks.pose(
-                    T, f"{segment.file('camera_image')}: {name}, frame {frame}"
-                ),
+                T_world_vehicle=checks.pose(T, where),
             )
     return {name: images for name, images in images_of_camera.items() if images}
 
@@ -175,12 +171,8 @@ def _read_cameras(
     segment: Segment, images: Mapping[str, Mapping[int, Image]]
 ) -> Iterator[tuple[str, Camera]]:
     """Yield the calibrated cameras that have images, with their names and rolling shutters."""
-    kinds = {
-        CAMERA: "i",
-        "extrinsic.transform": "l",
-        **dict.fromkeys(_LENS, "n"),
-        **dict.fromkeys(_SIZE, "i"),
-    }
+    kinds = {CAMERA: "i", "extrinsic.transform": "l"}
+    kinds |= {**dict.fromkeys(_LENS, "n"), **dict.fromkeys(_SIZE, "i")}
     columns = segment.read("camera_calibration", kinds)
     for name, camera_images in images.items():
         where = f"{segment.file('camera_calibration')}: {name}"
@@ -189,22 +181,18 @@ def _read_cameras(
         width, height, direction = (int(columns[key][row]) for key in _SIZE)
         readout_s = float(np.median([image.readout_s for image in camera_images.values()]))
         x, y = _READOUT.get(direction, (0.0, 0.0))
-        T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(
-            checks.pose(columns["extrinsic.transform"][row], where)
-        )
-        yield (
+        T_vehicle_cam = checks.pose(columns["extrinsic.transform"][row], where)
+        camera = checks.pinhole(
             name,
-            checks.pinhole(
-                name,
-                (width, height),
-                (f_u, f_v, c_u - 0.5, c_v - 0.5),
-                T_cam_vehicle,
-                where,
-                distortion=tuple(distortion) if any(distortion) else (),
-                row_time_s=y * readout_s / max(height, 1),
-                column_time_s=x * readout_s / max(width, 1),
-            ),
+            (width, height),
+            (f_u, f_v, c_u - 0.5, c_v - 0.5),
+            T_OPTICAL_WAYMO @ inverse(T_vehicle_cam),
+            where,
+            distortion=tuple(distortion) if any(distortion) else (),
+            row_time_s=y * readout_s / max(height, 1),
+            column_time_s=x * readout_s / max(width, 1),
         )
+        yield name, camera
 
 
 def _whole_us(seconds: float) -> int:
@@ -215,9 +203,8 @@ def _whole_us(seconds: float) -> int:
 def open_recording(path: Path, scene: str | None) -> Waymo:
     """Return the segment ``scene`` (CONTEXT) of a split's folder; None for the only one."""
     names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
-    none = (
-        "no segments; expected files such as lidar/10017090168044687777_6380_000_6400_000.parquet"
-    )
+    example = "lidar/10017090168044687777_6380_000_6400_000.parquet"
+    none = f"no segments; expected files such as {example}"
     return Waymo(path, checks.chosen_scene("waymo", path, scene, names, none))
 
 
@@ -315,8 +302,8 @@ class Waymo(FileSequence):
         return np.broadcast_to(np.rint(column_ns).astype(np.int64), (height, width))
 
     @cached_property
-    def _T_world_vehicle(self) -> dict[int, Float]:
-        """Poses T_world_vehicle (4,4) of the vehicle at the sweeps' stamps, by frame."""
+    def _T_world_vehicle(self) -> Float:
+        """(F,4,4) poses T_world_vehicle of the vehicle at the stamps of the F sweeps."""
         where = self._segment.file("vehicle_pose")
         kinds = {STAMP: "i", "world_from_vehicle.transform": "l"}
         columns = self._segment.read("vehicle_pose", kinds)
@@ -325,13 +312,14 @@ class Waymo(FileSequence):
             for us, values in zip(*columns.values(), strict=True)
         }
         T_of_frame = {f: T_of_start[us] for f, us in enumerate(self._starts_us) if us in T_of_start}
-        return {f: checks.find_entry(T_of_frame, f, "vehicle pose", where) for f in self.frames}
+        return np.stack(
+            [checks.find_entry(T_of_frame, f, "vehicle pose", where) for f in self.frames]
+        )
 
     @cached_property
     def _track(self) -> PoseTrack:
-        T = np.stack([self._T_world_vehicle[frame] for frame in self.frames])
         path = self._segment.file("vehicle_pose")
-        return PoseTrack(str(path), np.array(self._stamps_ns, np.int64), T)
+        return PoseTrack(str(path), np.array(self._stamps_ns, np.int64), self._T_world_vehicle)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         where = {CAMERA: CAMERAS.index(camera.name) + 1, STAMP: int(self._starts_us[number])}
