@@ -80,14 +80,12 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
     ]
     apart_ms = float(np.median(nearest_ns)) * 1e-6
     text = f"{len(exposed_ns)}, usually {apart_ms:.1f} ms from a sweep's reference time"
-    verdict = FINE
-    remedy = "choose other keys than these"
+    verdict, remedy = FINE, "choose other keys than these"
     if lacking:
         verdict = SUSPICIOUS
         text += f"; {len(lacking)} sweeps have none within a period: {format_frames(lacking)}"
     if len(lacking) == len(timeline.frames):
-        verdict = WRONG
-        remedy = "put sweeps and images on one clock"
+        verdict, remedy = WRONG, "put sweeps and images on one clock"
     values = {"num_images": len(exposed_ns), "num_without": len(lacking), "apart_ms": apart_ms}
     return finding(name, verdict, text, remedy, **values)
 
@@ -107,16 +105,15 @@ def camera_views(
     for row in np.unique(np.linspace(0, len(pairs) - 1, min(num_views, len(pairs))).astype(int)):
         registered, number = pairs[row]
         try:
-            image = sample.sequence.image(camera.name, number)
+            edges = image_edges(sample.sequence.image(camera.name, number), camera.focal_px)
         except InputError as error:
             return views, str(error)
-        frame = registered.sweep.frame
-        if frame not in silhouettes:
-            silhouettes[frame] = silhouettes_of(registered.sweep)
-        apart_s = (stamps_ns[number] - registered.sweep.stamp_ns) * 1e-9
+        sweep = registered.sweep
+        if sweep.frame not in silhouettes:
+            silhouettes[sweep.frame] = silhouettes_of(sweep)
+        apart_s = (stamps_ns[number] - sweep.stamp_ns) * 1e-9
         twist = registered.twist_after if apart_s > 0 else registered.twist_before
-        edges = image_edges(image, camera.focal_px)
-        views.append(View(silhouettes[frame], *edges, twist, apart_s))
+        views.append(View(silhouettes[sweep.frame], *edges, twist, apart_s))
     return views, ""
 
 

@@ -134,13 +134,12 @@ def _describe_scanner(sample: Sample, number: int, model: SensorModel) -> Findin
     silent = [sweep.frame for sweep in all_sweeps if not (sweep.lidar == number).any()]
     if silent:
         text += f", none in sweeps {format_frames(silent)}"
-    verdict = FINE
+    verdict, note = FINE, ""
     if silent or least < 0.5 * most:
-        verdict = SUSPICIOUS
-        text += "; some sweeps are broken off"
+        verdict, note = SUSPICIOUS, "; some sweeps are broken off"
     remedy = "leave the sweeps with few returns out"
     values = {"returns_least": least, "returns_most": most, "without_return": without_return}
-    return finding(f"scanner {number}", verdict, text, remedy, **values)
+    return finding(f"scanner {number}", verdict, text + note, remedy, **values)
 
 
 def check_own_vehicle(sample: Sample) -> list[Finding]:
@@ -222,14 +221,13 @@ def check_deskewing(sample: Sample) -> list[Finding]:
         f"point times as given, {reversed_m * 100:.1f} cm with the times reversed, "
         f"{without_m * 100:.1f} cm without times"
     )
-    verdict = FINE
-    remedy = "correct the sign of the point times, or --set register.deskew=false"
+    verdict, note = FINE, ""
     if min(reversed_m, without_m) * _CLEARLY_NEARER < given_m:
         verdict = WRONG
     elif given_m * _NEARER >= min(reversed_m, without_m):
-        verdict = UNKNOWN
-        text += ": too slow here to tell"
-    return [finding("deskewing", verdict, text, remedy, **values)]
+        verdict, note = UNKNOWN, ": too slow here to tell"
+    remedy = "correct the sign of the point times, or --set register.deskew=false"
+    return [finding("deskewing", verdict, text + note, remedy, **values)]
 
 
 def _apart_m(spot: Spot) -> float:
@@ -296,14 +294,13 @@ def _check_origin(name: str, points: Float, R: Float, origins_m: tuple[Float, Fl
         f"{given_sharpness:.2f}"
     )
     line = f"scanner_origins: {[[round(coordinate, 2) for coordinate in best_m]]}"
-    verdict = FINE
-    remedy = f"give the scanner's place in the points' frame ({line})"
+    verdict, note = FINE, ""
     if best_sharpness < LEAST_SHARPNESS:
-        verdict = UNKNOWN
-        text += "; no distinct rings"
+        verdict, note = UNKNOWN, "; no distinct rings"
     elif off_m > _OFF_M and best_sharpness > CLEARLY * given_sharpness:
         verdict = WRONG
-    return finding(name, verdict, text, remedy, **values)
+    remedy = f"give the scanner's place in the points' frame ({line})"
+    return finding(name, verdict, text + note, remedy, **values)
 
 
 def find_origin(points: Float, start_m: Float) -> Float:
@@ -350,7 +347,10 @@ def _check_compensation(
     rows = sample_rows(sweep, COMPENSATED_M)
     points = sweep.points[rows]
     is_untimed = sweep.offset_ns is None
-    offset_s = turning_s(points, period_s) if is_untimed else sweep.offset_ns[rows] * 1e-9
+    if sweep.offset_ns is None:
+        offset_s = turning_s(points, period_s)
+    else:
+        offset_s = np.asarray(sweep.offset_ns[rows] * 1e-9, np.float64)
     rings = rings_by_motion(points, offset_s, spot.twist, R, origins_m)
     if not rings.are_distinct:
         # The origin was searched in smeared rings. It is searched again in points as fired.
@@ -361,32 +361,26 @@ def _check_compensation(
         f"{rings.undone:.2f} with a compensation undone, {rings.done:.2f} with the motion "
         f"compensated"
     )
-    verdict = FINE
-    remedy = "--set register.deskew=false"
+    verdict, note, remedy = FINE, ": as they were fired", "--set register.deskew=false"
     if not rings.are_distinct:
-        verdict = UNKNOWN
-        text += "; no distinct rings"
+        verdict, note = UNKNOWN, "; no distinct rings"
     elif rings.are_compensated and is_untimed:
-        text += f": compensated to {rings.moment}, without times"
+        note = f": compensated to {rings.moment}, without times"
     elif rings.are_compensated:
         verdict = WRONG
-        text += (
+        note = (
             f": the sweeps are compensated already, to {rings.moment}, and would be a second time"
         )
     elif rings.as_stored < CLEARLY * rings.undone:
-        verdict = UNKNOWN
-        text += ": too alike to tell"
+        verdict, note = UNKNOWN, ": too alike to tell"
     elif is_untimed:
-        verdict = SUSPICIOUS
-        remedy = "give the points times (a column t in the files)"
-        text += (
+        verdict, remedy = SUSPICIOUS, "give the points times (a column t in the files)"
+        note = (
             f": the sweeps are as they were fired and no point has a time, so they stay stretched "
             f"by {spot.speed_m_s * period_s:.2f} m"
         )
-    else:
-        text += ": as they were fired"
     values = {"as_stored": rings.as_stored, "undone": rings.undone, "done": rings.done}
-    return finding(name, verdict, text, remedy, **values)
+    return finding(name, verdict, text + note, remedy, **values)
 
 
 def change_pose(
@@ -454,16 +448,16 @@ def check_poses(sample: Sample) -> list[Finding]:
         text += f", but only by {errors[best].m:.2f} m and {errors[best].deg:.2f} deg if {best}"
         return [finding("poses", WRONG, text, f"correct the poses, or {remedy}", **values)]
 
-    verdict = FINE if error_given.way_m >= _LEAST_WAY_M else UNKNOWN
+    verdict, note = FINE, ""
     if error_given.cost > 1:
         verdict = WRONG if error_given.cost > _WRONG_COST else SUSPICIOUS
         durations_s = [(last.stamp_ns - first.stamp_ns) * 1e-9 for first, last in map(_ends, spots)]
-        mistake, correction = main_error(recorded, odometry, float(np.mean(durations_s)))
-        text += mistake
+        note, correction = main_error(recorded, odometry, float(np.mean(durations_s)))
         remedy = correction + remedy
-    elif verdict == UNKNOWN:
-        text += "; the vehicle hardly moves"
-    return [finding("poses", verdict, text, remedy, **values), _check_clock(sample, odometry)]
+    elif error_given.way_m < _LEAST_WAY_M:
+        verdict, note = UNKNOWN, "; the vehicle hardly moves"
+    poses_finding = finding("poses", verdict, text + note, remedy, **values)
+    return [poses_finding, _check_clock(sample, odometry)]
 
 
 def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
@@ -491,15 +485,14 @@ def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
         f"odometry agrees best with the poses stamped {best_s * 1e3:+.0f} ms "
         f"({low_s * 1e3:+.0f} to {high_s * 1e3:+.0f}) later"
     )
-    verdict = FINE
-    remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
+    verdict, note = FINE, ""
     if high_s - low_s > _WIDEST_CLOCK_S:
-        verdict = UNKNOWN
-        text += "; the vehicle drives too evenly to tell"
+        verdict, note = UNKNOWN, "; the vehicle drives too evenly to tell"
     elif low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S:
         verdict = SUSPICIOUS
+    remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
     values = {"late_s": best_s, "low_s": low_s, "high_s": high_s}
-    return finding("clock of poses", verdict, text, remedy, **values)
+    return finding("clock of poses", verdict, text + note, remedy, **values)
 
 
 def _poses_around(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:

@@ -159,16 +159,14 @@ def _check_point_times_of(sample: Sample, lidar: int) -> Finding:
         f"{low_s * 1e3:+.1f} to {high_s * 1e3:+.1f} ms around the stamp, {span:.3g} periods; "
         f"the stamp is at {round(100 * -low_s / max(span_s, 1e-12))} % of the sweep"
     )
-    verdict = SUSPICIOUS
-    remedy = "compare the point times with the scanner's rate"
+    verdict, remedy = SUSPICIOUS, "compare the point times with the scanner's rate"
     if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
         verdict = FINE
     elif span < 1 and _TURN_S[0] <= span_s <= _TURN_S[1]:
         verdict = FINE
         text += f"; one of {round(1 / span)} turns of the scanner was kept"
     elif not _WRONG_SPAN[0] <= span <= _WRONG_SPAN[1]:
-        verdict = WRONG
-        remedy = "correct the unit of the point times"
+        verdict, remedy = WRONG, "correct the unit of the point times"
     name = "point times" + f" of scanner {lidar}" * (lidar > 0)
     return finding(name, verdict, text, remedy, first_s=low_s, last_s=high_s)
 
@@ -225,8 +223,7 @@ def check_axes(sample: Sample) -> list[Finding]:
     verdict = WRONG
     remedy = "turn the points so that z is up (sweeps: axes in densify.yaml)"
     if shares[best] < _LEAST_GROUND:
-        verdict = UNKNOWN
-        text = "no ground was found along any axis"
+        verdict, text = UNKNOWN, "no ground was found along any axis"
     elif shares["z"] >= _LEAST_GROUND or shares[best] < _CLEARLY * shares["z"]:
         verdict = FINE
     elif best in _UP_MEANS:
@@ -282,10 +279,9 @@ def check_intensity(sample: Sample) -> list[Finding]:
     """Check that intensities are between 0 and 1."""
     values = np.concatenate([sweep.intensity for sweep in sample.middles])
     low, high = float(values.min()), float(values.max())
-    verdict = FINE
-    text = f"{low:g} to {high:g}"
+    verdict, note = FINE, ""
     if low < 0 or high > 1:
-        verdict = SUSPICIOUS
-        text += ", expected 0 to 1; only pictures and the clouds' column suffer"
+        verdict, note = SUSPICIOUS, ", expected 0 to 1; only pictures and the clouds' column suffer"
+    text = f"{low:g} to {high:g}{note}"
     remedy = "scale the intensities (sweeps: intensity_scale in densify.yaml)"
     return [finding("intensity", verdict, text, remedy, lowest=low, highest=high)]

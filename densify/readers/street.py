@@ -11,9 +11,9 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -29,7 +29,6 @@ from densify.street.lidar import SENSORS, Returns
 from densify.street.scenes import PRESETS
 from densify.street.simulator import VERSION, Bodies, Simulator
 
-T = TypeVar("T")
 _progress = logging.getLogger("densify.progress")
 _SWEEPS_IN_MEMORY, _IMAGES_IN_MEMORY = 16, 8
 _OPTIONS = {"seed": "0", "sensor": "hdl64", "hz": "10", "tilt": "0", "cameras": ",".join(USUAL)}
@@ -75,10 +74,12 @@ class Street:
         self._building = Lock()
         self._cache: Cache | None = Cache(folder=own_folder("street"))
         self._posed = f"{VERSION} {preset} {seed}{options}, with any sensor"
-        self._swept = f"{VERSION} {preset} {seed} {sensor}{options}"
-        self._pictured = f"{VERSION} {preset} {seed} {hz} Hz, with any sensor"
-        self._returns = lru_cache(_SWEEPS_IN_MEMORY)(self._render_returns)
-        self._picture = lru_cache(_IMAGES_IN_MEMORY)(self._render_picture)
+        swept = f"{VERSION} {preset} {seed} {sensor}{options}"
+        pictured = f"{VERSION} {preset} {seed} {hz} Hz, with any sensor"
+        render = partial(self._from_cache, "sweep", swept, self.simulator.returns)
+        self._returns = lru_cache(_SWEEPS_IN_MEMORY)(render)
+        render = partial(self._from_cache, "image", pictured, self.simulator.picture)
+        self._picture = lru_cache(_IMAGES_IN_MEMORY)(render)
 
     @staticmethod
     def from_spec(spec: str) -> Street:
@@ -156,25 +157,16 @@ class Street:
         """Poses of the scanner and of all simulated bodies at the reference time of each frame."""
         return get_cached(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
 
-    def _render_returns(self, frame: int) -> Returns:
-        return self._from_cache(
-            "sweep", (self._swept, frame), lambda: self.simulator.returns(frame)
-        )
+    def _from_cache(self, step: str, scene: str, render: Callable[..., Any], *which: Any) -> Any:
+        """Return a cached result, or render and keep it; ``scene`` and ``which`` identify it."""
 
-    def _render_picture(self, camera: str, number: int) -> Picture:
-        inputs = (self._pictured, camera, number)
-        return self._from_cache("image", inputs, lambda: self.simulator.picture(camera, number))
-
-    def _from_cache(self, step: str, inputs: Any, render: Callable[[], T]) -> T:
-        """Return a cached result, or render and keep it; ``inputs`` identifies it."""
-
-        def rendered() -> T:
+        def rendered() -> Any:
             _announce()
             with self._building:
                 _ = self.simulator.scene.world.triangles  # made once, for all threads
-            return render()
+            return render(*which)
 
-        return get_cached(self._cache, step, lambda: inputs, rendered)
+        return get_cached(self._cache, step, lambda: (scene, *which), rendered)
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the true pose T_world_lidar (4,4) at the sweep's reference time."""
