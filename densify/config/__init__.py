@@ -101,10 +101,9 @@ class FlowSettings(Section):
     def around(self, points_per_s: float) -> tuple[float, float]:
         """Return two times in seconds: how far around a window motion is searched, and its step.
 
-        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar: sparse sweeps are
-        searched farther, and all of them.
+        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar: sparse sweeps show
+        little of a moving object, and are searched farther and all of them.
         """
-        # Sparse sweeps show little of a moving object, so more of them are searched, and farther.
         is_sparse = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
         return needed_s if self.look_around_s is None else self.look_around_s, step_s

@@ -160,17 +160,13 @@ class Annotations:
         """Inter- or extrapolate an object's box between key frames ``before`` and ``after``."""
         # At constant velocity and turn rate, as in the devkit. An object in only one of the two is
         # extrapolated from its nearest motion; it gets no track name, as its position is unknown.
-        for first, last in ((before, after), (after, after + 1), (before - 1, before)):
-            boxes = [
-                boxes_of_key[instance]
-                for boxes_of_key in self.boxes[max(first, 0) : last + 1]
-                if instance in boxes_of_key
-            ]
-            if 0 <= first < last < len(self.boxes) and len(boxes) == 2:
-                span_ns = self.key_ns[last] - self.key_ns[first]
+        for first in (before, after, before - 1):
+            pair = [boxes.get(instance) for boxes in self.boxes[max(first, 0) : first + 2]]
+            if first >= 0 and len(pair) == 2 and pair[0] and pair[1]:
+                span_ns = self.key_ns[first + 1] - self.key_ns[first]
                 share = float((stamp_ns - self.key_ns[first]) / span_ns)
-                T = interpolate(boxes[0].T_world_box, boxes[1].T_world_box, share)
-                return KeyBox(T, boxes[share > 0.5].size_m)
+                T = interpolate(pair[0].T_world_box, pair[1].T_world_box, share)
+                return KeyBox(T, (pair[1] if share > 0.5 else pair[0]).size_m)
         return {**self.boxes[before], **self.boxes[after]}[instance]
 
 
