@@ -213,7 +213,10 @@ def resolve(
     if isinstance(config, Mapping):
         _apply_changes(values, config, "configuration")
     elif isinstance(config, str | Path):
-        path = _config_path(config)
+        path = presets().get(config, Path(config)) if isinstance(config, str) else config
+        if not path.is_file():
+            hint = _expected(str(config), presets(), "preset")
+            raise InputError(f"configuration {config}: no such preset or file; {hint}")
         _apply_changes(values, read_yaml(path)[0] or {}, str(path))
     elif not isinstance(config, Config | None):
         raise InputError(
@@ -245,15 +248,6 @@ def presets() -> dict[str, Path]:
     inside = package / "configs"  # installed
     folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-
-
-def _config_path(name: str | Path) -> Path:
-    """Return the file of a preset or the named file; raise InputError if there is none."""
-    path = presets().get(name, Path(name)) if isinstance(name, str) else name
-    if path.is_file():
-        return path
-    hint = _expected(str(name), presets(), "preset")
-    raise InputError(f"configuration {name}: no such preset or file; {hint}")
 
 
 def apply_overrides(

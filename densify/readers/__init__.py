@@ -118,9 +118,13 @@ def _reader_of(parsed: Spec, where: str) -> Plugin:
     for reader in readers:
         if reader.recognises(parsed.path):
             return reader
-    inside = _recording_in(parsed.path, readers)
-    if inside is not None:
-        raise InputError(f"{where}: no recording itself; one in it is {inside}: name that")
+    # A recording inside, at most two levels down. Links may lead nowhere.
+    entries = [*parsed.path.glob("*"), *parsed.path.glob("*/*")][:_MOST_ENTRIES]
+    entries = sorted(entry for entry in entries if entry.exists())
+    for reader in readers:
+        for entry in entries:
+            if reader.recognises(entry):
+                raise InputError(f"{where}: no recording itself; one in it is {entry}: name that")
     raise InputError(
         f"{where}: no recording: {_what_is_there(parsed.path)}; expected one of the readers "
         f"{', '.join(reader.name for reader in readers)} (densify info --help says what each reads)"
@@ -138,14 +142,6 @@ def _what_is_there(path: Path) -> str:
     text = f"it holds {contents}, no lidar sweeps" if contents else "it is empty"
     drive = drive_around(path)
     return text if drive is None else f"{text}, and is inside a KITTI drive: give {drive}"
-
-
-def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
-    """Return the first recording in a folder, at most two levels down; None without one."""
-    entries = [*path.glob("*"), *path.glob("*/*")][:_MOST_ENTRIES] if path.is_dir() else []
-    entries = [entry for entry in sorted(entries) if entry.exists()]  # links may lead nowhere
-    recordings = (entry for reader in readers for entry in entries if reader.recognises(entry))
-    return next(recordings, None)
 
 
 def describe(sequence: LidarSequence) -> str:

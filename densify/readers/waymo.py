@@ -130,21 +130,6 @@ def _read_lasers(segment: Segment) -> dict[int, Laser]:
     return lasers
 
 
-def _read_boxes(segment: Segment) -> dict[int, Boxes]:
-    """Return boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
-    numbers = [f"box.{key}.{axis}" for key in ("center", "size") for axis in "xyz"]
-    kinds = {STAMP: "i", OBJECT: "s", **dict.fromkeys((*numbers, "box.heading"), "n")}
-    columns = segment.read("lidar_box", kinds)
-    centre_m, size_m = np.hsplit(np.stack([columns[n] for n in numbers], 1).astype(np.float64), 2)
-    T_vehicle_box = checks.upright_poses(centre_m, columns["box.heading"].astype(np.float64))
-    boxes = {}
-    for us in np.unique(columns[STAMP]).tolist():
-        rows = columns[STAMP] == us
-        where = f"{segment.file('lidar_box')}: frame_timestamp_micros {us}"
-        boxes[us] = checks.boxes(columns[OBJECT][rows], T_vehicle_box[rows], size_m[rows], where)
-    return boxes
-
-
 def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
     """Return times and poses of images by camera and frame; ``starts_us`` (n,) are the frames'."""
     keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
@@ -246,7 +231,22 @@ class Waymo(FileSequence):
 
     @cached_property
     def _boxes(self) -> dict[int, Boxes]:
-        return _read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
+        """Boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
+        path = self._segment.file("lidar_box")
+        if not path.is_file():
+            return {}
+        numbers = [f"box.{key}.{axis}" for key in ("center", "size") for axis in "xyz"]
+        kinds = {STAMP: "i", OBJECT: "s", **dict.fromkeys((*numbers, "box.heading"), "n")}
+        columns = self._segment.read("lidar_box", kinds)
+        values = np.stack([columns[name] for name in numbers], axis=1).astype(np.float64)
+        centre_m, size_m = np.hsplit(values, 2)
+        T_vehicle_box = checks.upright_poses(centre_m, columns["box.heading"].astype(np.float64))
+        boxes = {}
+        for us in np.unique(columns[STAMP]).tolist():
+            rows, where = columns[STAMP] == us, f"{path}: frame_timestamp_micros {us}"
+            names = columns[OBJECT][rows]
+            boxes[us] = checks.boxes(names, T_vehicle_box[rows], size_m[rows], where)
+        return boxes
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the (4,4) pose T_world_cam at the middle of the exposure of image ``number``."""
@@ -258,14 +258,18 @@ class Waymo(FileSequence):
         return T_world_vehicle @ inverse(self.cameras[camera].T_cam_lidar)
 
     def _returns(self, frame: int) -> Returns:
+        begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
         points, intensity, offset_ns, lidar = [], [], [], []
         for number, image in self._range_images(frame):
-            laser = self._lasers[number]
+            laser, (height, width) = self._lasers[number], image.shape[:2]
             rays = laser.directions(image.shape[:2]) * image[..., :1]
             in_vehicle = transform(laser.T_vehicle_laser, rays.reshape(-1, 3))
             points.append(np.where(image[..., 0].reshape(-1, 1) > 0, in_vehicle, np.nan))
             intensity.append(np.tanh(image[..., 1].ravel()))
-            offset_ns.append(self._offset_ns(frame, number, image.shape).ravel())
+            column_ns = begin_ns + (np.arange(width) + 0.5) / width * self._period_ns
+            if number != 1:  # not TOP: taken to be at the stamp
+                column_ns = np.zeros(width)
+            offset_ns.append(np.tile(np.rint(column_ns).astype(np.int64), height))
             lidar.append(np.full(len(in_vehicle), number - 1, np.uint8))
         # Lidars without a calibration keep the identity.
         T = np.tile(np.eye(4), (len(LASERS), 1, 1))
@@ -291,15 +295,6 @@ class Waymo(FileSequence):
                     height, width, num_channels = shape.tolist()
                     image = values.reshape(height, width, num_channels)
                     yield int(laser), image.astype(np.float64)
-
-    def _offset_ns(self, frame: int, laser: int, size: tuple[int, ...]) -> Int:
-        """Return firing times (H,W) in ns since the sweep's stamp, 0 for lidars other than TOP."""
-        height, width = size[:2]
-        if laser != 1:
-            return np.zeros((height, width), np.int64)
-        begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
-        column_ns = begin_ns + (np.arange(width) + 0.5) / width * self._period_ns
-        return np.broadcast_to(np.rint(column_ns).astype(np.int64), (height, width))
 
     @cached_property
     def _T_world_vehicle(self) -> Float:
