@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, Spot, finding
+from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, Spot
 from densify.free_space.ground import HeightMap, find_upright
 from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.free_space.sensor import SensorModel, Sensors
@@ -75,33 +75,33 @@ def check_registration(sample: Sample) -> list[Finding]:
     """Report sweeps that odometry cannot register."""
     failures = [spot.failure for spot in sample.spots if spot.trajectory is None]
     if len(sample.timeline.frames) < 2:
-        return [finding("registration", UNKNOWN, failures[0])]
+        return [Finding("registration", UNKNOWN, failures[0])]
     if not failures:
         speeds = ", ".join(f"{spot.speed_m_s:.1f}" for spot in sample.spots)
-        return [finding("registration", FINE, f"odometry finds {speeds} m/s")]
+        return [Finding("registration", FINE, f"odometry finds {speeds} m/s")]
     text = f"{len(failures)} of {len(sample.spots)} places cannot be registered: {failures[0]}"
     remedy = "mend what is wrong above first (unit of points, axes, stamps, point times)"
-    return [finding("registration", WRONG, text, remedy)]
+    return [Finding("registration", WRONG, text, remedy)]
 
 
 def check_frame(sample: Sample) -> list[Finding]:
     """Check that each sweep is in the frame of its own scanner, not in that of a map."""
     name = "frame of sweeps"
     if sample.unregistered:
-        return [finding(name, UNKNOWN, sample.unregistered)]
+        return [Finding(name, UNKNOWN, sample.unregistered)]
     if not all(is_still(s.trajectory.T_world_lidar) for s in sample.spots if s.trajectory):
-        return [finding(name, FINE, "the scanner's own: odometry finds motion")]
+        return [Finding(name, FINE, "the scanner's own: odometry finds motion")]
     way_m = way_in_map(sample.spots[0].sweeps[0], sample.spots[-1].sweeps[-1])
     if not way_m:
-        return [finding(name, FINE, "the scanner's own: all rays begin there")]
+        return [Finding(name, FINE, "the scanner's own: all rays begin there")]
     text = f"that of a map: odometry finds no motion, but rays begin up to {way_m:.1f} m apart"
-    return [finding(name, WRONG, text, MAP_FRAME_REMEDY, way_m=way_m)]
+    return [Finding(name, WRONG, text, MAP_FRAME_REMEDY, {"way_m": way_m})]
 
 
 def check_sensors(sample: Sample) -> list[Finding]:
     """Describe each scanner as the pipeline models it: rings, field of view, number of returns."""
     if sample.unregistered:
-        return [finding("scanners", UNKNOWN, sample.unregistered)]
+        return [Finding("scanners", UNKNOWN, sample.unregistered)]
     sweeps = [
         replace(registered, sweep=remove_unusable_returns(registered.sweep, sample.settings))
         for registered in sample.fastest.stretch.sweeps
@@ -139,7 +139,7 @@ def _describe_scanner(sample: Sample, number: int, model: SensorModel) -> Findin
         verdict, note = SUSPICIOUS, "; some sweeps are broken off"
     remedy = "leave the sweeps with few returns out"
     values = {"returns_least": least, "returns_most": most, "without_return": without_return}
-    return finding(f"scanner {number}", verdict, text + note, remedy, **values)
+    return Finding(f"scanner {number}", verdict, text + note, remedy, values)
 
 
 def check_own_vehicle(sample: Sample) -> list[Finding]:
@@ -152,7 +152,7 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
     ]
     if len(driving_spots) < 2:
         text = f"the vehicle drives in {len(driving_spots)} of the places looked at, two are needed"
-        return [finding("own vehicle", UNKNOWN, text)]
+        return [Finding("own vehicle", UNKNOWN, text)]
     range_m = np.linalg.norm(_own_returns(driving_spots), axis=1)
     num = len(range_m)
     least_m = sample.settings.min_range_m
@@ -165,7 +165,7 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
         verdict, text = FINE, "no returns of it"
     remedy = f"--set register.min_range_m={np.ceil(10 * farthest_m) / 10:.1f}"
     values = {"farthest_m": farthest_m, "num_returns": num}
-    return [finding("own vehicle", verdict, text, remedy, **values)]
+    return [Finding("own vehicle", verdict, text, remedy, values)]
 
 
 def _own_returns(spots: list[Spot]) -> Float:
@@ -200,11 +200,11 @@ def check_deskewing(sample: Sample) -> list[Finding]:
     """Compare how well sweeps align with the point times as given, reversed, and left out."""
     spot = sample.fastest
     if sample.unregistered:
-        return [finding("deskewing", UNKNOWN, sample.unregistered)]
+        return [Finding("deskewing", UNKNOWN, sample.unregistered)]
     if spot.sweeps[0].offset_ns is None:
-        return [finding("deskewing", UNKNOWN, "the points have no times")]
+        return [Finding("deskewing", UNKNOWN, "the points have no times")]
     if reason := sample.too_slow(_LEAST_DESKEWING_M_S):
-        return [finding("deskewing", UNKNOWN, reason)]
+        return [Finding("deskewing", UNKNOWN, reason)]
 
     untimed = [replace(sweep, offset_ns=None) for sweep in spot.sweeps]
     backward = [
@@ -227,7 +227,7 @@ def check_deskewing(sample: Sample) -> list[Finding]:
     elif given_m * _NEARER >= min(reversed_m, without_m):
         verdict, note = UNKNOWN, ": too slow here to tell"
     remedy = "correct the sign of the point times, or --set register.deskew=false"
-    return [finding("deskewing", verdict, text + note, remedy, **values)]
+    return [Finding("deskewing", verdict, text + note, remedy, values)]
 
 
 def _apart_m(spot: Spot) -> float:
@@ -264,7 +264,7 @@ def check_rings(sample: Sample) -> list[Finding]:
         points = _returns_of(sample, lidar) @ R.T
         if len(points) < _LEAST_RING_POINTS:
             text = f"{len(points)} near points, {_LEAST_RING_POINTS} are needed to tell"
-            findings.append(finding(name, UNKNOWN, text))
+            findings.append(Finding(name, UNKNOWN, text))
             continue
         origins_m = (given_m, find_origin(points, given_m))
         findings.append(_check_origin(name, points, R, origins_m))
@@ -300,7 +300,7 @@ def _check_origin(name: str, points: Float, R: Float, origins_m: tuple[Float, Fl
     elif off_m > _OFF_M and best_sharpness > CLEARLY * given_sharpness:
         verdict = WRONG
     remedy = f"give the scanner's place in the points' frame ({line})"
-    return finding(name, verdict, text + note, remedy, **values)
+    return Finding(name, verdict, text + note, remedy, values)
 
 
 def find_origin(points: Float, start_m: Float) -> Float:
@@ -340,7 +340,7 @@ def _check_compensation(
     """Check that the motion within a sweep is not compensated already."""
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     if reason := sample.too_slow(LEAST_SPEED_M_S):
-        return finding(name, UNKNOWN, reason)
+        return Finding(name, UNKNOWN, reason)
     spot = sample.fastest
     period_s = sample.timeline.period_ns * 1e-9
     sweep = spot.middle.select(spot.middle.lidar == lidar)
@@ -380,7 +380,7 @@ def _check_compensation(
             f"by {spot.speed_m_s * period_s:.2f} m"
         )
     values = {"as_stored": rings.as_stored, "undone": rings.undone, "done": rings.done}
-    return finding(name, verdict, text + note, remedy, **values)
+    return Finding(name, verdict, text + note, remedy, values)
 
 
 def change_pose(
@@ -423,10 +423,10 @@ def check_poses(sample: Sample) -> list[Finding]:
         recorded_ends = [[T_world_lidar(sweep.frame) for sweep in _ends(spot)] for spot in spots]
     except InputError as error:
         if "no poses" in str(error):
-            return [finding("poses", FINE, "none; the sweeps register themselves")]
-        return [finding("poses", WRONG, str(error), "--set register.source=kiss-icp")]
+            return [Finding("poses", FINE, "none; the sweeps register themselves")]
+        return [Finding("poses", WRONG, str(error), "--set register.source=kiss-icp")]
     if not spots:
-        return [finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
+        return [Finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
     # motions from the first to the last sweep of each spot
     odometry_ends = [[s.stretch.sweeps[row].T_world_lidar for row in (0, -1)] for s in spots]
     odometry, recorded = ([*map(_motion_between, ends)] for ends in (odometry_ends, recorded_ends))
@@ -446,7 +446,7 @@ def check_poses(sample: Sample) -> list[Finding]:
     is_much_better = errors[best].cost < min(_MUCH_BETTER * error_given.cost, _WRONG_COST)
     if error_given.cost > 1 and is_much_better:
         text += f", but only by {errors[best].m:.2f} m and {errors[best].deg:.2f} deg if {best}"
-        return [finding("poses", WRONG, text, f"correct the poses, or {remedy}", **values)]
+        return [Finding("poses", WRONG, text, f"correct the poses, or {remedy}", values)]
 
     verdict, note = FINE, ""
     if error_given.cost > 1:
@@ -456,7 +456,7 @@ def check_poses(sample: Sample) -> list[Finding]:
         remedy = correction + remedy
     elif error_given.way_m < _LEAST_WAY_M:
         verdict, note = UNKNOWN, "; the vehicle hardly moves"
-    poses_finding = finding("poses", verdict, text + note, remedy, **values)
+    poses_finding = Finding("poses", verdict, text + note, remedy, values)
     return [poses_finding, _check_clock(sample, odometry)]
 
 
@@ -478,7 +478,7 @@ def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
             cost[row] += np.sum((error[3:] / _NOISE_M) ** 2) + np.sum((error[:3] / _NOISE_RAD) ** 2)
     if not num_used:
         text = "the recording has too few poses before and after the sweeps looked at"
-        return finding("clock of poses", UNKNOWN, text)
+        return Finding("clock of poses", UNKNOWN, text)
     likely_s = late_s[cost < cost.min() + _EVEN_COST].tolist()
     low_s, high_s, best_s = min(likely_s), max(likely_s), float(late_s[np.argmin(cost)])
     text = (
@@ -492,7 +492,7 @@ def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
         verdict = SUSPICIOUS
     remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
     values = {"late_s": best_s, "low_s": low_s, "high_s": high_s}
-    return finding("clock of poses", verdict, text + note, remedy, **values)
+    return Finding("clock of poses", verdict, text + note, remedy, values)
 
 
 def _poses_around(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:

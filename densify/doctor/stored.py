@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, finding
+from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample
 from densify.free_space.raw_sweeps import (
     LOST_DEG,
     MAP_FRAME_REMEDY,
@@ -62,7 +62,7 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
             f"{len(sample.unreadable)} of the sweeps looked at cannot be read: frames "
             f"{format_frames(sample.unreadable)}; frame {frame}: {reason}"
         )
-        findings.append(finding("reading", WRONG, text, _FETCH))
+        findings.append(Finding("reading", WRONG, text, _FETCH))
     sequence = sample.sequence
     sizes = sequence.sweep_bytes() if hasattr(sequence, "sweep_bytes") else {}
     if sizes:
@@ -77,7 +77,7 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
             )
         verdict = WRONG if empty else SUSPICIOUS if short else FINE
         values = {"num_empty": len(empty), "num_short": len(short), "usual_bytes": int(usual)}
-        findings.append(finding("files", verdict, text, _FETCH, **values))
+        findings.append(Finding("files", verdict, text, _FETCH, values))
     return findings
 
 
@@ -93,9 +93,9 @@ def check_stamps(sample: Sample) -> list[Finding]:
             f"first of them frame {frame} ({reason})"
         )
         remedy = "correct the stamps of these sweeps, or remove their files"
-        return [finding("stamps", WRONG, text, remedy)]
+        return [Finding("stamps", WRONG, text, remedy)]
     if len(frames) < 2:
-        return [finding("stamps", UNKNOWN, "one sweep tells no rate")]
+        return [Finding("stamps", UNKNOWN, "one sweep tells no rate")]
     backward = np.flatnonzero(step_ns <= 0)
     if len(backward):
         row = int(backward[0])
@@ -105,7 +105,7 @@ def check_stamps(sample: Sample) -> list[Finding]:
             f"{frames[row]}"
         )
         remedy = "sort the sweeps by their stamps, or correct the file of stamps"
-        return [finding("stamps", WRONG, text, remedy, num_backward=len(backward))]
+        return [Finding("stamps", WRONG, text, remedy, {"num_backward": len(backward)})]
     findings = [_check_rate(timeline.period_ns * 1e-9)]
     holes = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
     if len(holes):
@@ -116,15 +116,18 @@ def check_stamps(sample: Sample) -> list[Finding]:
             f"(after frames {format_frames(frames[row] for row in holes)})"
         )
         remedy = "nothing, if the sweeps were never recorded; else fetch them again"
-        findings.append(finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(holes)))
+        findings.append(
+            Finding("holes in time", SUSPICIOUS, text, remedy, {"num_holes": len(holes)})
+        )
     return findings
 
 
 def _check_rate(period_s: float) -> Finding:
     """Check that the period of the sweeps is that of an existing scanner."""
     least_s, most_s = _PERIODS_S
+    values = {"period_s": period_s}
     if least_s <= period_s <= most_s:
-        return finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", period_s=period_s)
+        return Finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", values=values)
     text = f"from sweep to sweep {period_s:.3g} s pass, expected {least_s} to {most_s} s"
     verdict = SUSPICIOUS
     for mistake, factor in _STAMP_UNITS.items():
@@ -132,15 +135,15 @@ def _check_rate(period_s: float) -> Finding:
             verdict = WRONG
             text += f"; it would be {1 / (period_s * factor):.1f} Hz with {mistake}"
             break
-    return finding("stamps", verdict, text, "correct the unit of the stamps", period_s=period_s)
+    return Finding("stamps", verdict, text, "correct the unit of the stamps", values)
 
 
 def check_point_times(sample: Sample) -> list[Finding]:
     """Check that the firing times within a sweep span about one period."""
     if any(sweep.offset_ns is None for sweep in sample.middles):
-        return [finding("point times", UNKNOWN, "the points have no times")]
+        return [Finding("point times", UNKNOWN, "the points have no times")]
     if len(sample.timeline.frames) < 2:
-        return [finding("point times", UNKNOWN, "one sweep tells no period to compare with")]
+        return [Finding("point times", UNKNOWN, "one sweep tells no period to compare with")]
     return [_check_point_times_of(sample, lidar) for lidar in sample.lidars]
 
 
@@ -168,7 +171,7 @@ def _check_point_times_of(sample: Sample, lidar: int) -> Finding:
     elif not _WRONG_SPAN[0] <= span <= _WRONG_SPAN[1]:
         verdict, remedy = WRONG, "correct the unit of the point times"
     name = "point times" + f" of scanner {lidar}" * (lidar > 0)
-    return finding(name, verdict, text, remedy, first_s=low_s, last_s=high_s)
+    return Finding(name, verdict, text, remedy, {"first_s": low_s, "last_s": high_s})
 
 
 def check_units(sample: Sample) -> list[Finding]:
@@ -179,7 +182,7 @@ def check_units(sample: Sample) -> list[Finding]:
     range_m = float(np.median([_median_range_m(points) for points in clouds]))
     if least_m <= range_m <= most_m:
         text = f"half of the returns within {range_m:.1f} m"
-        return [finding(name, FINE, text, median_range_m=range_m)]
+        return [Finding(name, FINE, text, values={"median_range_m": range_m})]
 
     # Points in a map's coordinates are far from the origin, but close to each other.
     spreads_m = [_median_range_m(points - np.median(points, axis=0)) for points in clouds]
@@ -199,7 +202,7 @@ def check_units(sample: Sample) -> list[Finding]:
     else:
         text += f", expected {least_m} to {most_m:.0f} m"
         verdict = SUSPICIOUS
-    return [finding(name, verdict, text, remedy, median_range_m=range_m)]
+    return [Finding(name, verdict, text, remedy, {"median_range_m": range_m})]
 
 
 def _median_range_m(points: Float) -> float:
@@ -229,7 +232,7 @@ def check_axes(sample: Sample) -> list[Finding]:
     elif best in _UP_MEANS:
         text += f" ({_UP_MEANS[best]})"
     values = {f"share_{axis}": share for axis, share in shares.items()}
-    return [finding("axes", verdict, text, remedy, **values)]
+    return [Finding("axes", verdict, text, remedy, values)]
 
 
 def _ground_share(sweep: Sweep, up: Float) -> float:
@@ -267,12 +270,12 @@ def check_directions(sample: Sample) -> list[Finding]:
             f"measured"
         )
         remedy = "lost packets: record with a larger buffer of the socket, or leave sweeps out"
-        return [finding(name, SUSPICIOUS, text, remedy, lost_deg=widest_deg)]
+        return [Finding(name, SUSPICIOUS, text, remedy, {"lost_deg": widest_deg})]
     if sectors[0] is not None and None not in sectors:
         text = f"no returns from {sectors[0][0]} to {sectors[0][1]} deg of azimuth in any sweep"
         remedy = "a blind sector: something covers the scanner, or the sweeps were cropped"
-        return [finding(name, SUSPICIOUS, text, remedy)]
-    return [finding(name, FINE, "returns all around, as far as the scanner sees")]
+        return [Finding(name, SUSPICIOUS, text, remedy)]
+    return [Finding(name, FINE, "returns all around, as far as the scanner sees")]
 
 
 def check_intensity(sample: Sample) -> list[Finding]:
@@ -284,4 +287,4 @@ def check_intensity(sample: Sample) -> list[Finding]:
         verdict, note = SUSPICIOUS, ", expected 0 to 1; only pictures and the clouds' column suffer"
     text = f"{low:g} to {high:g}{note}"
     remedy = "scale the intensities (sweeps: intensity_scale in densify.yaml)"
-    return [finding("intensity", verdict, text, remedy, lowest=low, highest=high)]
+    return [Finding("intensity", verdict, text, remedy, {"lowest": low, "highest": high})]
