@@ -193,17 +193,19 @@ def test_tracking_and_360_are_given_back(format, camera, recorded, excerpt):
     check_truth(sequence, excerpt)
 
 
-def test_scenes(recorded):
-    root = recorded("kitti-odometry").parent.parent
-    assert open_sequence(root).name == open_sequence(f"kitti-odometry:{root}#00").name == "00"
-    for name, scene in (("kitti-tracking", "0000"), ("kitti-360", DRIVE)):
-        assert scene in open_sequence(f"{name}:{recorded(name)}#{scene}").name
-    for reader in ("kitti-odometry", "kitti-tracking", "kitti-360"):
-        spec = root if reader == "kitti-odometry" else recorded(reader)
-        with pytest.raises(InputError, match="no recording 77; choose one"):
-            open_sequence(f"{reader}:{spec}#77")
-        with pytest.raises(InputError, match=r"no KITTI.* expected"):
-            open_sequence(f"{reader}:{spec.parent}")
+@pytest.mark.parametrize(
+    ("format", "scene"),
+    [("kitti-odometry", "00"), ("kitti-tracking", "0000"), ("kitti-360", DRIVE)],
+)
+def test_scenes(recorded, format, scene):
+    place = recorded(format)
+    root = place.parent.parent if format == "kitti-odometry" else place
+    names = {open_sequence(spec).name for spec in (root, f"{format}:{root}#{scene}")}
+    assert len(names) == 1 and scene in names.pop()
+    with pytest.raises(InputError, match="no recording 77; choose one"):
+        open_sequence(f"{format}:{root}#77")
+    with pytest.raises(InputError, match=r"no KITTI.* expected"):
+        open_sequence(f"{format}:{root.parent}")
 
 
 def test_sparse_poses_are_interpolated(copied):
@@ -222,18 +224,9 @@ FISHEYE = """%YAML:1.0
 ---
 image_width: 1400
 image_height: 1400
-mirror_parameters:
-   xi: 2.2
-distortion_parameters:
-   k1: 0.016
-   k2: 1.65
-   p1: 0.0
-   p2: 0.0
-projection_parameters:
-   gamma1: 1336.0
-   gamma2: 1335.0
-   u0: 716.9
-   v0: 705.7
+mirror_parameters: {xi: 2.2}
+distortion_parameters: {k1: 0.016, k2: 1.65, p1: 0.0, p2: 0.0}
+projection_parameters: {gamma1: 1336.0, gamma2: 1335.0, u0: 716.9, v0: 705.7}
 """
 
 
