@@ -267,7 +267,10 @@ class NuScenes(FileSequence):
             root,
             list(sweeps),
             cameras={c: self._camera(c, data[0]) for c, data in self._images.items()},
-            exposed_ns={c: {n: images[c][n].stamp_ns for n in files[c]} for c in files},
+            exposed_ns={
+                camera: {number: images[camera][number].stamp_ns for number in numbers}
+                for camera, numbers in files.items()
+            },
             truth=checks.truth_beside(root),
             files=sweeps,
             images=files,
