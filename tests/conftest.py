@@ -36,7 +36,7 @@ LONGEST = (
     *("examples", "street", "fuzz", "gate", "dataset", "recording", "learning_training"),
     *("bench", "registration", "pipeline", "far", "executor", "cli"),
     *("doctor", "report", "groups", "labels"),
-    *("bench_paper", "reader_pandaset", "flow_sets"),
+    *("bench_paper", "reader_data_sets", "flow_sets"),
 )
 """Files of tests that take long begin, so that no process works on one while the others wait at the
 end. While the first file compiles every inner loop, the next two simulate and compile none: two

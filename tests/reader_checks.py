@@ -22,15 +22,13 @@ def check_sweeps(
     T_lidar_ego: np.ndarray | None = None,
     point_m: float = 1e-6,
     offset_ns: int = 1,
-    row_of: np.ndarray | None = None,
     clock_ns: int = 0,
 ) -> None:
     """Points as they were fired, their times, scanners, intensities and the poses.
 
     clock_ns: what the format's clock says more than the street's. reference_ns: how much later than
     the street's the format's reference time is. T_lidar_ego: the frame in which the format has the
-    points. point_m, offset_ns: what the format rounds. row_of: which of the street's returns each
-    row is, where the format sorts them.
+    points. point_m, offset_ns: what the format rounds.
     """
     street = excerpt.street
     T_ego_lidar = np.eye(4) if T_lidar_ego is None else inverse(T_lidar_ego)
@@ -41,14 +39,13 @@ def check_sweeps(
     first = inverse(sequence.T_world_lidar(0))
     for number, frame in enumerate(excerpt.frames):
         read, true = sequence[number], street[frame]
-        rows = np.arange(len(true)) if row_of is None else row_of
         assert sequence.stamp_ns(number) == read.stamp_ns == true.stamp_ns + reference_ns + clock_ns
         assert len(read) == len(true)
-        moved = transform(T_ego_lidar, true.points[rows])
+        moved = transform(T_ego_lidar, true.points)
         np.testing.assert_allclose(read.points, moved, atol=point_m)
-        assert np.abs(read.offset_ns + reference_ns - true.offset_ns[rows]).max() <= offset_ns
-        np.testing.assert_array_equal(read.lidar, true.lidar[rows])
-        np.testing.assert_allclose(read.intensity, true.intensity[rows], atol=1 / 255)
+        assert np.abs(read.offset_ns + reference_ns - true.offset_ns).max() <= offset_ns
+        np.testing.assert_array_equal(read.lidar, true.lidar)
+        np.testing.assert_allclose(read.intensity, true.intensity, atol=1 / 255)
         step = first @ sequence.T_world_lidar(number)
         np.testing.assert_allclose(step, inverse(T_world_ego[0]) @ T_world_ego[number], atol=1e-5)
 
@@ -87,6 +84,23 @@ def check_cameras(
                 np.testing.assert_array_equal(got, expected)
             else:
                 assert np.abs(got.astype(int) - expected).mean() < 4
+
+
+def check_image_poses(
+    sequence: LidarSequence,
+    excerpt: Excerpt,
+    atol: float,
+    names: Mapping[str, str] | None = None,
+) -> None:
+    """The pose of a camera at each exposure; names as in `check_cameras`."""
+    street = excerpt.street
+    for name in excerpt.cameras:
+        T_lidar_cam = inverse(street.cameras[name].T_cam_lidar)
+        for number, image in enumerate(excerpt.image_numbers(name)):
+            exposed_ns = street.image_stamps_ns(name)[image]
+            expected = street.simulator.T_world_lidar_at(exposed_ns) @ T_lidar_cam
+            read = sequence.T_world_cam((names or {}).get(name, name), number)
+            np.testing.assert_allclose(read, expected, atol=atol)
 
 
 def check_truth(sequence: LidarSequence, excerpt: Excerpt) -> None:

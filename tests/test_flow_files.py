@@ -21,9 +21,6 @@ STEP = (100, 101)
 PLAIN = POSES_GIVEN | {"project": {"visibility": False}}  # no point has a say in another's depth
 
 
-# --- from the pipeline and back -------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory) -> tuple[Result, Path]:
     """A run with the flow it found, and the folder of its flow files."""
@@ -79,9 +76,6 @@ def test_other_forms_of_the_same_flow(ours, dropped, tmp_path):
         assert np.array_equal(read.moving, expected.moving)
         moved_m = expected.total[expected.moving]
         np.testing.assert_allclose(read.total[read.moving], moved_m, atol=2e-5)
-
-
-# --- one file -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -156,9 +150,8 @@ BAD_ARRAYS = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_ARRAYS)
-def test_flow_files_of_another_form(case, stretch, tmp_path):
-    arrays, message = BAD_ARRAYS[case]
+@pytest.mark.parametrize(("arrays", "message"), BAD_ARRAYS.values(), ids=BAD_ARRAYS)
+def test_flow_files_of_another_form(arrays, message, stretch, tmp_path):
     path = saved(tmp_path, **arrays)
     with pytest.raises(InputError, match=message) as caught:
         read_step(tmp_path, stretch, 0, 1)

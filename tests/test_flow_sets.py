@@ -107,8 +107,8 @@ def test_other_forms_hold_the_same(log, submission, tmp_path):
     np.testing.assert_array_equal(residual.astype(np.float16), submitted)
 
 
-def labels_of(log: Path, folder: Path, by_number: bool) -> Path:
-    """The exact truth in the form of Argoverse 2's labels; every object is a car."""
+def labels_of(log: Path, folder: Path) -> Path:
+    """The exact truth in the form of Argoverse 2's labels, by number; every object is a car."""
     truth = open_sequence(log).truth
     (folder / log.name).mkdir(parents=True)
     for frame, sweep in enumerate(sweep_files(log)[:-1]):
@@ -117,15 +117,14 @@ def labels_of(log: Path, folder: Path, by_number: bool) -> Path:
         exact = truth.displacement(frame, frame + 1)
         true[: len(exact)], instance[: len(exact)] = exact, truth.sweep(frame).instance
         columns = dict(zip(AXES, true.T.copy(), strict=True))
-        columns |= {"is_valid": np.ones(num_rows, bool)}
-        columns |= {"classes_0": np.where(instance >= 0, 18, -1).astype(np.int8)}
-        name = f"{frame:010d}.feather" if by_number else sweep.name
-        feather.write_feather(arrow.table(columns), folder / log.name / name)
+        columns["is_valid"] = np.ones(num_rows, bool)
+        columns["classes_0"] = np.where(instance >= 0, 18, -1).astype(np.int8)
+        feather.write_feather(arrow.table(columns), folder / log.name / f"{frame:010d}.feather")
     return folder
 
 
 def test_labels_score_as_the_truth_they_are_made_of(log, tmp_path, capsys):
-    labels = labels_of(log, tmp_path / "labels", by_number=True)
+    labels = labels_of(log, tmp_path / "labels")
     command = ["bench", "flow", "--data", str(log), "--key", "2", "--window", "2", *GIVEN]
     command += ["--methods", "ours,rigid"]
     assert main([*command, "--truth", str(labels), "--json"]) == 0
@@ -215,7 +214,7 @@ def test_what_is_there_is_kept(log, submission, capsys):
 def test_labels_by_number_and_what_is_wrong_with_them(log, tmp_path):
     points = open_sequence(log)[0].points[:5]
     stretch = Stretch(tuple(registered(frame, points) for frame in (0, 1)))
-    labels, empty = labels_of(log, tmp_path / "labels", True), tmp_path / "empty"
+    labels, empty = labels_of(log, tmp_path / "labels"), tmp_path / "empty"
     path = labels / log.name / "0000000000.feather"
     feather.write_feather(feather.read_table(path, memory_map=False).slice(0, 3), path)
     empty.mkdir()

@@ -59,16 +59,16 @@ def python(*arguments: object, **environment: str) -> str:
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Makes a package with one entry point that this process finds."""
 
-    def make(group: str, name: str, code: str, package: str = "stranger") -> str:
-        folder = tmp_path / package
-        about = folder / f"{package}-1.0.dist-info"
+    def make(group: str, name: str, code: str) -> str:
+        folder, module = tmp_path / "stranger", "stranger_code"
+        about = folder / "stranger-1.0.dist-info"
         about.mkdir(parents=True)
-        (folder / f"{package}_code.py").write_text(dedent(code))
-        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-        (about / "entry_points.txt").write_text(f"[{group}]\n{name} = {package}_code\n")
+        (folder / f"{module}.py").write_text(dedent(code))
+        (about / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+        (about / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}\n")
         monkeypatch.syspath_prepend(str(folder))
-        monkeypatch.delitem(sys.modules, f"{package}_code", raising=False)
-        return f"{package}_code"
+        monkeypatch.delitem(sys.modules, module, raising=False)
+        return module
 
     return make
 

@@ -132,9 +132,6 @@ def test_a_flat_folder_is_of_one_camera(tmp_path):
         PriorFiles.open(tmp_path, ["left", "right"])
 
 
-# --- a run ----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """The small street without a prior, and with its truth as one, inverse and of another scale."""

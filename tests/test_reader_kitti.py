@@ -88,13 +88,10 @@ def test_cameras_project_as_the_calibration_chain_says(drive):
     )
     (drive.parent / "calib_velo_to_cam.txt").write_text(f"R: {words(R)}\nT: {words(t)}\n")
     (drive / "image_03").mkdir()  # not in the calibration
-    read = KittiRaw(drive).cameras
-    assert list(read) == ["image_02"] and (
-        read["image_02"].width_px,
-        read["image_02"].height_px,
-    ) == (40, 20)
+    (camera,) = KittiRaw(drive).cameras.values()
+    assert (camera.name, camera.width_px, camera.height_px) == ("image_02", 40, 20)
     point = np.array([12.0, 1.5, -0.7])
-    projected = read["image_02"].K @ poses.transform(read["image_02"].T_cam_lidar, point[None])[0]
+    projected = camera.K @ poses.transform(camera.T_cam_lidar, point[None])[0]
     np.testing.assert_allclose(projected, P @ [*R_rect @ (R @ point + t), 1], rtol=1e-12)
 
 
@@ -142,9 +139,7 @@ def test_a_line_that_is_no_stamp_costs_its_frame_alone(drive):
 def test_description_of_a_drive(drive):
     (drive / f"velodyne_points/data/{MIDDLE:010d}.bin").unlink()
     sequence = KittiRaw(drive)
-    lines = describe(sequence).splitlines()
-    table = {line.split("  ")[0]: line.split("  ", 1)[1].strip() for line in lines}
-    assert table["name"] == drive.name
+    table = dict(line.split(maxsplit=1) for line in describe(sequence).splitlines())
     assert table["frames"] == f"{FIRST}, {LAST} (2, 1 missing between them)"
     assert table["rate"] == "5.00 Hz"
     num_points = (f"{len(sequence[frame]):,} in frame {frame}" for frame in (FIRST, LAST))
@@ -152,9 +147,6 @@ def test_description_of_a_drive(drive):
     assert table["image_02"].startswith("1242 x 375 px, fx ")
     assert table["image_02"].endswith(f"rectified, 3 images: {FIRST}-{LAST}, 10.00 Hz")
     assert table["poses"].startswith("yes, a path of ") and table["truth"] == "none"
-    assert str(sequence.stamp_ns(FIRST)) in table["stamps"]
-    starts = {len(line) - len(line.split("  ", 1)[1].lstrip()) for line in lines}
-    assert len(starts) == 1  # aligned
 
 
 # Relatives
@@ -201,17 +193,19 @@ def test_tracking_and_360_are_given_back(format, camera, recorded, excerpt):
     check_truth(sequence, excerpt)
 
 
-def test_scenes(recorded):
-    root = recorded("kitti-odometry").parent.parent
-    assert open_sequence(root).name == open_sequence(f"kitti-odometry:{root}#00").name == "00"
-    for name, scene in (("kitti-tracking", "0000"), ("kitti-360", DRIVE)):
-        assert scene in open_sequence(f"{name}:{recorded(name)}#{scene}").name
-    for reader in ("kitti-odometry", "kitti-tracking", "kitti-360"):
-        spec = root if reader == "kitti-odometry" else recorded(reader)
-        with pytest.raises(InputError, match="no recording 77; choose one"):
-            open_sequence(f"{reader}:{spec}#77")
-        with pytest.raises(InputError, match=r"no KITTI.* expected"):
-            open_sequence(f"{reader}:{spec.parent}")
+@pytest.mark.parametrize(
+    ("format", "scene"),
+    [("kitti-odometry", "00"), ("kitti-tracking", "0000"), ("kitti-360", DRIVE)],
+)
+def test_scenes(recorded, format, scene):
+    place = recorded(format)
+    root = place.parent.parent if format == "kitti-odometry" else place
+    names = {open_sequence(spec).name for spec in (root, f"{format}:{root}#{scene}")}
+    assert len(names) == 1 and scene in names.pop()
+    with pytest.raises(InputError, match="no recording 77; choose one"):
+        open_sequence(f"{format}:{root}#77")
+    with pytest.raises(InputError, match=r"no KITTI.* expected"):
+        open_sequence(f"{format}:{root.parent}")
 
 
 def test_sparse_poses_are_interpolated(copied):
@@ -230,18 +224,9 @@ FISHEYE = """%YAML:1.0
 ---
 image_width: 1400
 image_height: 1400
-mirror_parameters:
-   xi: 2.2
-distortion_parameters:
-   k1: 0.016
-   k2: 1.65
-   p1: 0.0
-   p2: 0.0
-projection_parameters:
-   gamma1: 1336.0
-   gamma2: 1335.0
-   u0: 716.9
-   v0: 705.7
+mirror_parameters: {xi: 2.2}
+distortion_parameters: {k1: 0.016, k2: 1.65, p1: 0.0, p2: 0.0}
+projection_parameters: {gamma1: 1336.0, gamma2: 1335.0, u0: 716.9, v0: 705.7}
 """
 
 
@@ -277,9 +262,7 @@ def test_a_fisheye_projects_as_the_data_sets_tools_do(copied):
 
 def test_real_odometry_sweeps(test_data):
     path = test_data / "kitti_odometry/sequences/00"
-    for place in (path, path.parent.parent):
-        sequence = open_sequence(place)
-        assert isinstance(sequence, KittiOdometry)
+    sequence = open_sequence(path)
     assert list(sequence.frames) == [0, 1, 2] and not sequence.cameras
     assert [len(sequence[n]) for n in range(3)] == [124_668, 124_605, 124_478]
     sweep = sequence[0]
@@ -315,22 +298,19 @@ def test_undoing_sharpens_real_elevations(test_data, tmp_path):
 DRIVES = "kitti/2011_09_26/2011_09_26_drive_{}_sync"
 
 
-@pytest.mark.parametrize(
-    ("drive", "frames", "cameras"),
-    [("0013", range(96, 136), ["image_02"]), ("0002", range(10), ["image_02", "image_03"])],
-)
-def test_real_drive(test_data, drive, frames, cameras):
+@pytest.mark.parametrize(("drive", "frame", "num_cameras"), [("0013", 101, 1), ("0002", 5, 2)])
+def test_real_drive(test_data, drive, frame, num_cameras):
     """Of whole drives or of excerpts that have these."""
     sequence = KittiRaw(test_data / DRIVES.format(drive))
-    assert {*frames} <= {*sequence.frames} and {*cameras} <= {*sequence.cameras}
-    sweep = sequence[frames[5]]
+    assert len(sequence.cameras) >= num_cameras
+    sweep = sequence[frame]
     assert 110_000 < len(sweep) < 130_000
     assert np.abs(sweep.offset_ns).max() < 52_000_000
     assert np.ptp(sweep.offset_ns) > 100_000_000
-    for name in cameras:
+    for name in ("image_02", "image_03")[:num_cameras]:
         camera = sequence.cameras[name]
-        assert sequence.image(name, frames[5]).shape == (375, 1242, 3)
-        lag_ns = sequence.image_stamps_ns(name)[frames[5]] - sweep.stamp_ns
+        assert sequence.image(name, frame).shape == (375, 1242, 3)
+        lag_ns = sequence.image_stamps_ns(name)[frame] - sweep.stamp_ns
         assert abs(lag_ns) < 1_000_000
         p = poses.transform(camera.T_cam_lidar, sweep.points)
         u, v, _ = (camera.K @ p[p[:, 2] > 1].T) / p[p[:, 2] > 1, 2]

@@ -31,21 +31,15 @@ def test_points_at_their_own_times_follow_the_path(track):
     stamp_ns = 5_200_000_000
     offset_ns = rng.integers(-100_000_000, 100_000_000, 300)
     world = rng.uniform(-40, 40, (300, 3))
-    fired = np.stack(
-        [
-            transform(inverse(pose(stamp_ns + int(t))), p[None])[0]
-            for t, p in zip(offset_ns, world, strict=True)
-        ]
-    )
+    fired = [
+        transform(inverse(pose(stamp_ns + int(late_ns))), point[None])[0]
+        for late_ns, point in zip(offset_ns, world, strict=True)
+    ]
     at_stamp = transform(inverse(pose(stamp_ns)), world)
-    np.testing.assert_allclose(
-        track.undo_compensation(at_stamp, stamp_ns, offset_ns), fired, atol=2e-4
-    )
-    np.testing.assert_allclose(track.compensate(fired, stamp_ns, offset_ns), at_stamp, atol=2e-4)
-    back = track.compensate(
-        track.undo_compensation(world, stamp_ns, offset_ns), stamp_ns, offset_ns
-    )
-    np.testing.assert_allclose(back, world, atol=1e-9)
+    undone = track.undo_compensation(at_stamp, stamp_ns, offset_ns)
+    np.testing.assert_allclose(undone, fired, atol=2e-4)
+    back = track.compensate(undone, stamp_ns, offset_ns)
+    np.testing.assert_allclose(back, at_stamp, atol=1e-9)
     assert np.linalg.norm(at_stamp - fired, axis=1).max() > 0.7
 
 

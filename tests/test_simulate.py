@@ -9,8 +9,7 @@ import pytest
 from densify.geometry.poses import inverse
 from densify.outputs.simulated_street import write_street
 from densify.readers.kitti import KittiRaw
-from densify.readers.street import Street
-from densify.readers.truth_files import FileTruth, write_bodies, write_points
+from densify.readers.street import FileTruth, Street, write_bodies, write_points
 from densify.street.simulator import Bodies
 from tests.exported import refusal
 

@@ -101,10 +101,9 @@ class FlowSettings(Section):
     def around(self, points_per_s: float) -> tuple[float, float]:
         """Return two times in seconds: how far around a window motion is searched, and its step.
 
-        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar: sparse sweeps are
-        searched farther, and all of them.
+        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar: sparse sweeps show
+        little of a moving object, and are searched farther and all of them.
         """
-        # Sparse sweeps show little of a moving object, so more of them are searched, and farther.
         is_sparse = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
         return needed_s if self.look_around_s is None else self.look_around_s, step_s
@@ -214,7 +213,10 @@ def resolve(
     if isinstance(config, Mapping):
         _apply_changes(values, config, "configuration")
     elif isinstance(config, str | Path):
-        path = _config_path(config)
+        path = presets().get(config, Path(config)) if isinstance(config, str) else config
+        if not path.is_file():
+            hint = _expected(str(config), presets(), "preset")
+            raise InputError(f"configuration {config}: no such preset or file; {hint}")
         _apply_changes(values, read_yaml(path)[0] or {}, str(path))
     elif not isinstance(config, Config | None):
         raise InputError(
@@ -246,15 +248,6 @@ def presets() -> dict[str, Path]:
     inside = package / "configs"  # installed
     folder = inside if inside.is_dir() else package.parent / "configs"  # checkout
     return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
-
-
-def _config_path(name: str | Path) -> Path:
-    """Return the file of a preset or the named file; raise InputError if there is none."""
-    path = presets().get(name, Path(name)) if isinstance(name, str) else name
-    if path.is_file():
-        return path
-    hint = _expected(str(name), presets(), "preset")
-    raise InputError(f"configuration {name}: no such preset or file; {hint}")
 
 
 def apply_overrides(

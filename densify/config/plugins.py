@@ -107,15 +107,11 @@ class Table:
                 f"{label}: {point.value} is no module with {', '.join(self.members)}; mend or "
                 f"uninstall the package"
             )
-        # Field of `Plugin` -> name in the module
-        attributes = {field.name: field.name.upper() for field in fields(Plugin)}
-        attributes["recognises"] = "recognises"
-        values = {
-            name: getattr(module, attribute)
-            for name, attribute in attributes.items()
-            if hasattr(module, attribute)
-        }
-        return Plugin(**{**values, "name": point.name, "module": module.__name__})
+        values: dict[str, Any] = {"name": point.name, "module": module.__name__}
+        for field in fields(Plugin)[2:]:  # all but name and module
+            attribute = field.name if field.name == "recognises" else field.name.upper()
+            values[field.name] = getattr(module, attribute, field.default)
+        return Plugin(**values)
 
 
 ENGINES = Table(

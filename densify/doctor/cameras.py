@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from densify.config.errors import InputError
 from densify.doctor.motion import CAM_AXES, change_pose
-from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, finding
+from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample
 from densify.geometry import poses
 from densify.geometry.types import Camera, Float, RegisteredSweep
 from densify.readers.timeline import format_frames
@@ -46,7 +46,7 @@ _DIRECTIONS = (
 def check_cameras(sample: Sample) -> list[Finding]:
     """Check the images, the calibration and the clock of every camera."""
     if not sample.sequence.cameras:
-        return [finding("cameras", FINE, "none: the cloud and the scores alone")]
+        return [Finding("cameras", FINE, "none: the cloud and the scores alone")]
     findings = []
     silhouettes: dict[int, Silhouettes] = {}  # frame -> silhouettes, shared by the cameras
     for camera in sample.sequence.cameras.values():
@@ -54,11 +54,11 @@ def check_cameras(sample: Sample) -> list[Finding]:
         views, read_error = camera_views(sample, camera, silhouettes)
         if read_error:
             remedy = "fetch the image again, or give size and calibration of images like it"
-            findings.append(finding(f"{camera.name}: images", WRONG, read_error, remedy))
+            findings.append(Finding(f"{camera.name}: images", WRONG, read_error, remedy))
         findings += check_calibration(camera, views)
         if findings[-1].check != f"{camera.name}: clock":
             text = "not compared, because the calibration is not known to be right"
-            findings.append(finding(f"{camera.name}: clock", UNKNOWN, text))
+            findings.append(Finding(f"{camera.name}: clock", UNKNOWN, text))
     return findings
 
 
@@ -69,7 +69,7 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
     exposed_ns = np.array(sorted(sample.sequence.image_stamps_ns(camera.name).values()), np.int64)
     if not len(exposed_ns):
         remedy = f"leave the camera out (--camera with the others), or fetch {camera.name}"
-        return finding(name, SUSPICIOUS, "not a single image", remedy)
+        return Finding(name, SUSPICIOUS, "not a single image", remedy)
     # Times count from the first image, to keep their digits in floating point.
     tree = cKDTree(exposed_ns[:, None] - exposed_ns[0])
     nearest_ns = np.asarray(tree.query(timeline.stamp_ns[:, None] - exposed_ns[0])[0])
@@ -80,16 +80,14 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
     ]
     apart_ms = float(np.median(nearest_ns)) * 1e-6
     text = f"{len(exposed_ns)}, usually {apart_ms:.1f} ms from a sweep's reference time"
-    verdict = FINE
-    remedy = "choose other keys than these"
+    verdict, remedy = FINE, "choose other keys than these"
     if lacking:
         verdict = SUSPICIOUS
         text += f"; {len(lacking)} sweeps have none within a period: {format_frames(lacking)}"
     if len(lacking) == len(timeline.frames):
-        verdict = WRONG
-        remedy = "put sweeps and images on one clock"
+        verdict, remedy = WRONG, "put sweeps and images on one clock"
     values = {"num_images": len(exposed_ns), "num_without": len(lacking), "apart_ms": apart_ms}
-    return finding(name, verdict, text, remedy, **values)
+    return Finding(name, verdict, text, remedy, values)
 
 
 def camera_views(
@@ -107,16 +105,15 @@ def camera_views(
     for row in np.unique(np.linspace(0, len(pairs) - 1, min(num_views, len(pairs))).astype(int)):
         registered, number = pairs[row]
         try:
-            image = sample.sequence.image(camera.name, number)
+            edges = image_edges(sample.sequence.image(camera.name, number), camera.focal_px)
         except InputError as error:
             return views, str(error)
-        frame = registered.sweep.frame
-        if frame not in silhouettes:
-            silhouettes[frame] = silhouettes_of(registered.sweep)
-        apart_s = (stamps_ns[number] - registered.sweep.stamp_ns) * 1e-9
+        sweep = registered.sweep
+        if sweep.frame not in silhouettes:
+            silhouettes[sweep.frame] = silhouettes_of(sweep)
+        apart_s = (stamps_ns[number] - sweep.stamp_ns) * 1e-9
         twist = registered.twist_after if apart_s > 0 else registered.twist_before
-        edges = image_edges(image, camera.focal_px)
-        views.append(View(silhouettes[frame], *edges, twist, apart_s))
+        views.append(View(silhouettes[sweep.frame], *edges, twist, apart_s))
     return views, ""
 
 
@@ -151,7 +148,7 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
     num_images = len(views)
     if num_images < _LEAST_IMAGES:
         text = f"{num_images} images near registered sweeps, {_LEAST_IMAGES} are needed to tell"
-        return [finding(name, UNKNOWN, text)]
+        return [Finding(name, UNKNOWN, text)]
 
     with_clock = any(np.linalg.norm(view.twist[3:]) > _LEAST_SPEED_M_S for view in views)
     fit = best_fit(camera, views, with_clock)
@@ -160,7 +157,7 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
     values |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), fit.offset.tolist(), strict=False))
     if mistake_score > _CLEARLY * max(fit.score, fit.rival, 0.0):
         text = f"depth discontinuities lie on image edges with {mistake}, and not as given"
-        return [finding(name, WRONG, text, f"give {mistake}", **values)]
+        return [Finding(name, WRONG, text, f"give {mistake}", values)]
 
     explanations = [_best_explanation(fit, with_clock), *map(_explanation, fit.others)]
     # Offsets that fit equally matter unless the best fit changes less than each of them.
@@ -174,7 +171,7 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
     if with_clock:
         return [calibration, _check_clock(camera, fit, num_images)]
     text = f"the vehicle is slower than {_LEAST_SPEED_M_S:g} m/s where it was looked at"
-    return [calibration, finding(f"{camera.name}: clock", UNKNOWN, text)]
+    return [calibration, Finding(f"{camera.name}: clock", UNKNOWN, text)]
 
 
 def _report_ambiguous(
@@ -195,7 +192,7 @@ def _report_ambiguous(
         "check T_cam_lidar, K and the clocks, and that the images are the camera's; sweeps at "
         "rest tell a turn from a clock"
     )
-    return finding(name, verdict, text, remedy, **values)
+    return Finding(name, verdict, text, remedy, values)
 
 
 def _report_offset(
@@ -218,8 +215,11 @@ def _report_offset(
         text = f"right within {_OFF_DEG} deg: {text}"
     if len(explanations) > 1:
         text += f"; more changes at once fit about equally: {'; or '.join(explanations[1:])}"
-    name = f"{camera.name}: calibration"
-    return finding(name, verdict, text, _corrected_line(camera, fit), **values)
+    # Angles that are 0 within two standard errors are left as they are.
+    corrected = turned(camera, np.where(np.abs(fit.offset) > 2 * fit.error, fit.offset, 0.0))
+    where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
+    remedy = f"T_cam_lidar: {corrected.T_cam_lidar[:3].round(5).tolist()}  # {where}"
+    return Finding(f"{camera.name}: calibration", verdict, text, remedy, values)
 
 
 def _best_mistake(camera: Camera, views: list[View]) -> tuple[str, float]:
@@ -252,14 +252,6 @@ def _explanation(offset: Float) -> str:
     return f"{', '.join(turns)} and images {1e3 * offset[3]:+.0f} ms late"
 
 
-def _corrected_line(camera: Camera, fit: Fit) -> str:
-    """Return the corrected line. Angles that are 0 within two standard errors are left."""
-    offset = np.where(np.abs(fit.offset) > 2 * fit.error, fit.offset, 0.0)
-    rows = turned(camera, offset).T_cam_lidar[:3].round(5).tolist()
-    where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
-    return f"T_cam_lidar: {rows}  # {where}"
-
-
 def _check_clock(camera: Camera, fit: Fit, num_images: int) -> Finding:
     """Report the difference between the clocks of camera and lidar."""
     late_s, error_s = float(fit.offset[3]), float(fit.error[3])
@@ -272,4 +264,4 @@ def _check_clock(camera: Camera, fit: Fit, num_images: int) -> Finding:
         verdict = WRONG if abs(late_s) - 2 * error_s > _CLOCK_WRONG_S else SUSPICIOUS
     remedy = f"add {late_s:+.3f} s to the stamps of {camera.name}"
     values = {"late_s": late_s, "error_s": error_s}
-    return finding(f"{camera.name}: clock", verdict, text, remedy, **values)
+    return Finding(f"{camera.name}: clock", verdict, text, remedy, values)

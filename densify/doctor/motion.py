@@ -9,23 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.doctor.sample import (
-    FINE,
-    SUSPICIOUS,
-    UNKNOWN,
-    WRONG,
-    Finding,
-    Sample,
-    Spot,
-    Value,
-    finding,
-)
+from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, Spot
 from densify.free_space.ground import HeightMap, find_upright
 from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.free_space.sensor import SensorModel, Sensors
@@ -84,34 +75,33 @@ def check_registration(sample: Sample) -> list[Finding]:
     """Report sweeps that odometry cannot register."""
     failures = [spot.failure for spot in sample.spots if spot.trajectory is None]
     if len(sample.timeline.frames) < 2:
-        return [finding("registration", UNKNOWN, failures[0])]
+        return [Finding("registration", UNKNOWN, failures[0])]
     if not failures:
         speeds = ", ".join(f"{spot.speed_m_s:.1f}" for spot in sample.spots)
-        return [finding("registration", FINE, f"odometry finds {speeds} m/s")]
+        return [Finding("registration", FINE, f"odometry finds {speeds} m/s")]
     text = f"{len(failures)} of {len(sample.spots)} places cannot be registered: {failures[0]}"
     remedy = "mend what is wrong above first (unit of points, axes, stamps, point times)"
-    return [finding("registration", WRONG, text, remedy)]
+    return [Finding("registration", WRONG, text, remedy)]
 
 
 def check_frame(sample: Sample) -> list[Finding]:
     """Check that each sweep is in the frame of its own scanner, not in that of a map."""
     name = "frame of sweeps"
-    trajectories = [spot.trajectory for spot in sample.spots if spot.trajectory]
     if sample.unregistered:
-        return [finding(name, UNKNOWN, sample.unregistered)]
-    if not all(is_still(trajectory.T_world_lidar) for trajectory in trajectories):
-        return [finding(name, FINE, "the scanner's own: odometry finds motion")]
+        return [Finding(name, UNKNOWN, sample.unregistered)]
+    if not all(is_still(s.trajectory.T_world_lidar) for s in sample.spots if s.trajectory):
+        return [Finding(name, FINE, "the scanner's own: odometry finds motion")]
     way_m = way_in_map(sample.spots[0].sweeps[0], sample.spots[-1].sweeps[-1])
     if not way_m:
-        return [finding(name, FINE, "the scanner's own: all rays begin there")]
+        return [Finding(name, FINE, "the scanner's own: all rays begin there")]
     text = f"that of a map: odometry finds no motion, but rays begin up to {way_m:.1f} m apart"
-    return [finding(name, WRONG, text, MAP_FRAME_REMEDY, way_m=way_m)]
+    return [Finding(name, WRONG, text, MAP_FRAME_REMEDY, {"way_m": way_m})]
 
 
 def check_sensors(sample: Sample) -> list[Finding]:
     """Describe each scanner as the pipeline models it: rings, field of view, number of returns."""
     if sample.unregistered:
-        return [finding("scanners", UNKNOWN, sample.unregistered)]
+        return [Finding("scanners", UNKNOWN, sample.unregistered)]
     sweeps = [
         replace(registered, sweep=remove_unusable_returns(registered.sweep, sample.settings))
         for registered in sample.fastest.stretch.sweeps
@@ -132,10 +122,11 @@ def _describe_scanner(sample: Sample, number: int, model: SensorModel) -> Findin
     low, high = np.rad2deg(model.elevation_rad)
     right, left = np.rad2deg(model.azimuth_rad)
     counts = [int((sweep.lidar == number).sum()) for sweep in spot.sweeps]
+    least, most = min(counts), max(counts)
     text = (
         f"{kind}, {low:.1f} to {high:.1f} deg up, {right:.0f} to {left:.0f} deg around, "
-        f"{np.rad2deg(model.azimuth_step_rad):.2f} deg from ray to ray, {min(counts):,} to "
-        f"{max(counts):,} returns a sweep"
+        f"{np.rad2deg(model.azimuth_step_rad):.2f} deg from ray to ray, {least:,} to {most:,} "
+        f"returns a sweep"
     )
     if without_return > _LEAST_WITHOUT:
         text += f", {100 * without_return:.0f} % of the rows without a return"
@@ -143,19 +134,12 @@ def _describe_scanner(sample: Sample, number: int, model: SensorModel) -> Findin
     silent = [sweep.frame for sweep in all_sweeps if not (sweep.lidar == number).any()]
     if silent:
         text += f", none in sweeps {format_frames(silent)}"
-    verdict = FINE
-    if silent or min(counts) < 0.5 * max(counts):
-        verdict = SUSPICIOUS
-        text += "; some sweeps are broken off"
-    return finding(
-        f"scanner {number}",
-        verdict,
-        text,
-        "leave the sweeps with few returns out",
-        returns_least=min(counts),
-        returns_most=max(counts),
-        without_return=without_return,
-    )
+    verdict, note = FINE, ""
+    if silent or least < 0.5 * most:
+        verdict, note = SUSPICIOUS, "; some sweeps are broken off"
+    remedy = "leave the sweeps with few returns out"
+    values = {"returns_least": least, "returns_most": most, "without_return": without_return}
+    return Finding(f"scanner {number}", verdict, text + note, remedy, values)
 
 
 def check_own_vehicle(sample: Sample) -> list[Finding]:
@@ -168,19 +152,20 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
     ]
     if len(driving_spots) < 2:
         text = f"the vehicle drives in {len(driving_spots)} of the places looked at, two are needed"
-        return [finding("own vehicle", UNKNOWN, text)]
-    returns = _own_returns(driving_spots)
-    num = len(returns)
+        return [Finding("own vehicle", UNKNOWN, text)]
+    range_m = np.linalg.norm(_own_returns(driving_spots), axis=1)
+    num = len(range_m)
     least_m = sample.settings.min_range_m
     # The farthest 1 % may be chance returns.
-    range_m = float(np.percentile(np.linalg.norm(returns, axis=1), 99)) if num else 0.0
-    values: dict[str, Value] = {"farthest_m": range_m, "num_returns": num}
+    farthest_m = float(np.percentile(range_m, 99)) if num else 0.0
+    where, verdict = ("beyond", SUSPICIOUS) if farthest_m > least_m else ("all within", FINE)
+    text = f"{num} returns a sweep, at most {farthest_m:.1f} m away, {where} register.min_range_m"
+    text += f" = {least_m:g}"
     if num < _LEAST_RETURNS:
-        return [finding("own vehicle", FINE, "no returns of it", "", **values)]
-    where, verdict = ("beyond", SUSPICIOUS) if range_m > least_m else ("all within", FINE)
-    text = f"{num} returns a sweep, at most {range_m:.1f} m away, {where} register.min_range_m"
-    remedy = f"--set register.min_range_m={np.ceil(10 * range_m) / 10:.1f}"
-    return [finding("own vehicle", verdict, f"{text} = {least_m:g}", remedy, **values)]
+        verdict, text = FINE, "no returns of it"
+    remedy = f"--set register.min_range_m={np.ceil(10 * farthest_m) / 10:.1f}"
+    values = {"farthest_m": farthest_m, "num_returns": num}
+    return [Finding("own vehicle", verdict, text, remedy, values)]
 
 
 def _own_returns(spots: list[Spot]) -> Float:
@@ -215,52 +200,45 @@ def check_deskewing(sample: Sample) -> list[Finding]:
     """Compare how well sweeps align with the point times as given, reversed, and left out."""
     spot = sample.fastest
     if sample.unregistered:
-        return [finding("deskewing", UNKNOWN, sample.unregistered)]
+        return [Finding("deskewing", UNKNOWN, sample.unregistered)]
     if spot.sweeps[0].offset_ns is None:
-        return [finding("deskewing", UNKNOWN, "the points have no times")]
+        return [Finding("deskewing", UNKNOWN, "the points have no times")]
     if reason := sample.too_slow(_LEAST_DESKEWING_M_S):
-        return [finding("deskewing", UNKNOWN, reason)]
+        return [Finding("deskewing", UNKNOWN, reason)]
 
+    untimed = [replace(sweep, offset_ns=None) for sweep in spot.sweeps]
+    backward = [
+        sweep if sweep.offset_ns is None else replace(sweep, offset_ns=-sweep.offset_ns)
+        for sweep in spot.sweeps
+    ]
     given_m = _apart_m(spot)
-    reversed_m = _apart_m(_with_times(sample, spot, -1))
-    without_m = _apart_m(_with_times(sample, spot, 0))
+    reversed_m, without_m = (
+        _apart_m(Spot.of(tuple(sweeps), sample.settings)) for sweeps in (backward, untimed)
+    )
     values = {"given_m": given_m, "reversed_m": reversed_m, "without_m": without_m}
     text = (
         f"sweeps {len(spot.sweeps) - 1} apart lie {given_m * 100:.1f} cm from each other with the "
         f"point times as given, {reversed_m * 100:.1f} cm with the times reversed, "
         f"{without_m * 100:.1f} cm without times"
     )
-    verdict = FINE
-    remedy = "correct the sign of the point times, or --set register.deskew=false"
+    verdict, note = FINE, ""
     if min(reversed_m, without_m) * _CLEARLY_NEARER < given_m:
         verdict = WRONG
     elif given_m * _NEARER >= min(reversed_m, without_m):
-        verdict = UNKNOWN
-        text += ": too slow here to tell"
-    return [finding("deskewing", verdict, text, remedy, **values)]
-
-
-def _with_times(sample: Sample, spot: Spot, sign: int) -> Spot:
-    """Return a spot with the point times multiplied by ``sign``, without times if it is 0."""
-    sweeps = []
-    for sweep in spot.sweeps:
-        offset_ns = sweep.offset_ns
-        if offset_ns is not None:
-            offset_ns = sign * offset_ns if sign else None
-        sweeps.append(replace(sweep, offset_ns=offset_ns))
-    return Spot.of(tuple(sweeps), sample.settings)
+        verdict, note = UNKNOWN, ": too slow here to tell"
+    remedy = "correct the sign of the point times, or --set register.deskew=false"
+    return [Finding("deskewing", verdict, text + note, remedy, values)]
 
 
 def _apart_m(spot: Spot) -> float:
     """Return the median distance (m) of near points of a spot's end sweeps; 1 m if unknown."""
     if spot.trajectory is None:
         return _APART_M
-    first, last = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]
-    first_points = _near_above_ground(first.sweep.points)
-    last_points = _near_above_ground(last.sweep.points)
+    ends = spot.stretch.sweeps[0], spot.stretch.sweeps[-1]
+    first_points, last_points = (_near_above_ground(end.sweep.points) for end in ends)
     if min(len(first_points), len(last_points)) < _LEAST_POINTS:
         return _APART_M
-    T_first_last = poses.inverse(first.T_world_lidar) @ last.T_world_lidar
+    T_first_last = _motion_between([end.T_world_lidar for end in ends])
     queries = poses.transform(T_first_last, last_points)[::4]  # every fourth is enough
     tree = cKDTree(first_points)
     distance_m, _ = tree.query(queries, distance_upper_bound=_APART_M, workers=-1)
@@ -278,18 +256,18 @@ def _near_above_ground(points: Float) -> Float:
 def check_rings(sample: Sample) -> list[Finding]:
     """Check the position of each scanner, and that its sweeps are not motion-compensated yet."""
     findings = []
+    sweep = sample.spots[0].sweeps[0]
     for lidar in sample.lidars:
-        sweep = sample.spots[0].sweeps[0]
+        name = "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
         R = sweep.axes(lidar)  # rings are level in the scanner's own axes
         given_m = R @ sweep.origin_m(lidar)
         points = _returns_of(sample, lidar) @ R.T
         if len(points) < _LEAST_RING_POINTS:
             text = f"{len(points)} near points, {_LEAST_RING_POINTS} are needed to tell"
-            findings.append(finding(_check_name(lidar), UNKNOWN, text))
+            findings.append(Finding(name, UNKNOWN, text))
             continue
-        sharpest_m = find_origin(points, given_m)
-        origins_m = (given_m, sharpest_m)
-        findings.append(_check_origin(lidar, points, R, origins_m))
+        origins_m = (given_m, find_origin(points, given_m))
+        findings.append(_check_origin(name, points, R, origins_m))
         findings.append(_check_compensation(sample, lidar, R, origins_m))
     return findings
 
@@ -303,36 +281,26 @@ def _returns_of(sample: Sample, lidar: int) -> Float:
     return np.concatenate(points)[:: len(points)]  # about as many as of one sweep
 
 
-def _check_origin(lidar: int, points: Float, R: Float, origins_m: tuple[Float, Float]) -> Finding:
+def _check_origin(name: str, points: Float, R: Float, origins_m: tuple[Float, Float]) -> Finding:
     """Compare a scanner's given position (3,) with that of the sharpest rings, scanner axes."""
     given_sharpness, best_sharpness = (sharpness(points, origin_m) for origin_m in origins_m)
     off_m = float(np.linalg.norm(origins_m[1] - origins_m[0]))
-    given_m, best_m = (origin_m @ R for origin_m in origins_m)
-    values = {"given_m": given_m.tolist(), "found_m": best_m.tolist(), "off_m": off_m}
+    given_m, best_m = ((origin_m @ R).tolist() for origin_m in origins_m)
+    given, best = ("({:.2f}, {:.2f}, {:.2f})".format(*position) for position in (given_m, best_m))
+    values = {"given_m": given_m, "found_m": best_m, "off_m": off_m}
     values |= {"sharpness_given": given_sharpness, "sharpness_found": best_sharpness}
     text = (
-        f"rings are sharpest ({best_sharpness:.2f}) seen from {_format_position(best_m)}; from the "
-        f"given {_format_position(given_m)}: {given_sharpness:.2f}"
+        f"rings are sharpest ({best_sharpness:.2f}) seen from {best}; from the given {given}: "
+        f"{given_sharpness:.2f}"
     )
-    line = f"scanner_origins: {[[round(float(coordinate), 2) for coordinate in best_m]]}"
-    verdict = FINE
-    remedy = f"give the scanner's place in the points' frame ({line})"
+    line = f"scanner_origins: {[[round(coordinate, 2) for coordinate in best_m]]}"
+    verdict, note = FINE, ""
     if best_sharpness < LEAST_SHARPNESS:
-        verdict = UNKNOWN
-        text += "; no distinct rings"
+        verdict, note = UNKNOWN, "; no distinct rings"
     elif off_m > _OFF_M and best_sharpness > CLEARLY * given_sharpness:
         verdict = WRONG
-    return finding(_check_name(lidar), verdict, text, remedy, **values)
-
-
-def _check_name(lidar: int) -> str:
-    """Return the name of the check of a scanner's position."""
-    return "scanner's place" if lidar == 0 else f"place of scanner {lidar}"
-
-
-def _format_position(position_m: Float) -> str:
-    """Return the coordinates of a position (3,) as a text."""
-    return "(" + ", ".join(f"{coordinate:.2f}" for coordinate in position_m) + ")"
+    remedy = f"give the scanner's place in the points' frame ({line})"
+    return Finding(name, verdict, text + note, remedy, values)
 
 
 def find_origin(points: Float, start_m: Float) -> Float:
@@ -372,7 +340,7 @@ def _check_compensation(
     """Check that the motion within a sweep is not compensated already."""
     name = "motion compensation" + f" of scanner {lidar}" * (lidar > 0)
     if reason := sample.too_slow(LEAST_SPEED_M_S):
-        return finding(name, UNKNOWN, reason)
+        return Finding(name, UNKNOWN, reason)
     spot = sample.fastest
     period_s = sample.timeline.period_ns * 1e-9
     sweep = spot.middle.select(spot.middle.lidar == lidar)
@@ -393,29 +361,26 @@ def _check_compensation(
         f"{rings.undone:.2f} with a compensation undone, {rings.done:.2f} with the motion "
         f"compensated"
     )
-    verdict = FINE
-    remedy = "--set register.deskew=false"
+    verdict, note, remedy = FINE, ": as they were fired", "--set register.deskew=false"
     if not rings.are_distinct:
-        verdict = UNKNOWN
-        text += "; no distinct rings"
+        verdict, note = UNKNOWN, "; no distinct rings"
     elif rings.are_compensated and is_untimed:
-        text += f": compensated to {rings.moment}, without times"
+        note = f": compensated to {rings.moment}, without times"
     elif rings.are_compensated:
         verdict = WRONG
-        text += f": the sweeps are compensated already, to {rings.moment}, and would be a second"
-        text += " time"
+        note = (
+            f": the sweeps are compensated already, to {rings.moment}, and would be a second time"
+        )
     elif rings.as_stored < CLEARLY * rings.undone:
-        verdict = UNKNOWN
-        text += ": too alike to tell"
+        verdict, note = UNKNOWN, ": too alike to tell"
     elif is_untimed:
-        verdict = SUSPICIOUS
-        remedy = "give the points times (a column t in the files)"
-        text += ": the sweeps are as they were fired and no point has a time, so they stay"
-        text += f" stretched by {spot.speed_m_s * period_s:.2f} m"
-    else:
-        text += ": as they were fired"
+        verdict, remedy = SUSPICIOUS, "give the points times (a column t in the files)"
+        note = (
+            f": the sweeps are as they were fired and no point has a time, so they stay stretched "
+            f"by {spot.speed_m_s * period_s:.2f} m"
+        )
     values = {"as_stored": rings.as_stored, "undone": rings.undone, "done": rings.done}
-    return finding(name, verdict, text, remedy, **values)
+    return Finding(name, verdict, text + note, remedy, values)
 
 
 def change_pose(
@@ -432,15 +397,10 @@ def change_pose(
     return change
 
 
-def _roll_quaternion(places: int) -> Callable[[Float], Float]:
-    """Return a function that rolls a rotation's quaternion x y z w, as `numpy.roll`."""
-
-    def roll(R: Float) -> Float:
-        quaternion = np.roll(Rotation.from_matrix(R).as_quat(), places)
-        rolled: Float = Rotation.from_quat(quaternion).as_matrix()
-        return rolled
-
-    return roll
+def _roll_quaternion(places: int, R: Float) -> Float:
+    """Return a rotation (3,3) whose quaternion x y z w is rolled, as by `numpy.roll`."""
+    quaternion = np.roll(Rotation.from_matrix(R).as_quat(), places)
+    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
 
 
 HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
@@ -448,8 +408,8 @@ HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
     "they are a camera's, not the lidar's": lambda T: poses.inverse(CAM_AXES) @ T @ CAM_AXES,
     "they are in millimetres": change_pose(scale=1e-3),
     "they are in kilometres": change_pose(scale=1e3),
-    "their quaternions are x y z w, read as w x y z": change_pose(_roll_quaternion(1)),
-    "their quaternions are w x y z, read as x y z w": change_pose(_roll_quaternion(-1)),
+    "their quaternions are x y z w, read as w x y z": change_pose(partial(_roll_quaternion, 1)),
+    "their quaternions are w x y z, read as x y z w": change_pose(partial(_roll_quaternion, -1)),
     "their rotations are transposed": change_pose(np.transpose),
 }
 """Common mistake of poses -> the function (4,4) -> (4,4) that corrects it."""
@@ -459,21 +419,17 @@ def check_poses(sample: Sample) -> list[Finding]:
     """Compare the poses as given, and corrected for each of `HYPOTHESES`, with odometry."""
     spots = sample.registered
     try:
-        recorded_ends = [
-            [sample.sequence.T_world_lidar(sweep.frame) for sweep in _ends(spot)] for spot in spots
-        ]
+        T_world_lidar = sample.sequence.T_world_lidar
+        recorded_ends = [[T_world_lidar(sweep.frame) for sweep in _ends(spot)] for spot in spots]
     except InputError as error:
         if "no poses" in str(error):
-            return [finding("poses", FINE, "none; the sweeps register themselves")]
-        return [finding("poses", WRONG, str(error), "--set register.source=kiss-icp")]
+            return [Finding("poses", FINE, "none; the sweeps register themselves")]
+        return [Finding("poses", WRONG, str(error), "--set register.source=kiss-icp")]
     if not spots:
-        return [finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
+        return [Finding("poses", UNKNOWN, "no sweeps could be registered to compare with")]
     # motions from the first to the last sweep of each spot
-    odometry = [
-        _motion_between([spot.stretch.sweeps[row].T_world_lidar for row in (0, -1)])
-        for spot in spots
-    ]
-    recorded = [_motion_between(ends) for ends in recorded_ends]
+    odometry_ends = [[s.stretch.sweeps[row].T_world_lidar for row in (0, -1)] for s in spots]
+    odometry, recorded = ([*map(_motion_between, ends)] for ends in (odometry_ends, recorded_ends))
     error_given = RecordedError.of(recorded, odometry)
     text = (
         f"off by {error_given.m:.2f} m and {error_given.deg:.2f} deg from odometry over "
@@ -490,18 +446,18 @@ def check_poses(sample: Sample) -> list[Finding]:
     is_much_better = errors[best].cost < min(_MUCH_BETTER * error_given.cost, _WRONG_COST)
     if error_given.cost > 1 and is_much_better:
         text += f", but only by {errors[best].m:.2f} m and {errors[best].deg:.2f} deg if {best}"
-        return [finding("poses", WRONG, text, f"correct the poses, or {remedy}", **values)]
+        return [Finding("poses", WRONG, text, f"correct the poses, or {remedy}", values)]
 
-    verdict = FINE if error_given.way_m >= _LEAST_WAY_M else UNKNOWN
+    verdict, note = FINE, ""
     if error_given.cost > 1:
         verdict = WRONG if error_given.cost > _WRONG_COST else SUSPICIOUS
         durations_s = [(last.stamp_ns - first.stamp_ns) * 1e-9 for first, last in map(_ends, spots)]
-        mistake, correction = main_error(recorded, odometry, float(np.mean(durations_s)))
-        text += mistake
+        note, correction = main_error(recorded, odometry, float(np.mean(durations_s)))
         remedy = correction + remedy
-    elif verdict == UNKNOWN:
-        text += "; the vehicle hardly moves"
-    return [finding("poses", verdict, text, remedy, **values), _check_clock(sample, odometry)]
+    elif error_given.way_m < _LEAST_WAY_M:
+        verdict, note = UNKNOWN, "; the vehicle hardly moves"
+    poses_finding = Finding("poses", verdict, text + note, remedy, values)
+    return [poses_finding, _check_clock(sample, odometry)]
 
 
 def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
@@ -517,30 +473,26 @@ def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
             continue
         num_used += 1
         for row, seconds in enumerate(late_s):
-            ends_ns = [int(ns + 1e9 * seconds) for ns in (first_ns, last_ns)]
-            recorded = _motion_between([track.at(ns) for ns in ends_ns])
-            error = poses.log(poses.inverse(recorded) @ T_first_last)
+            ends = [track.at(int(ns + 1e9 * seconds)) for ns in (first_ns, last_ns)]
+            error = poses.log(poses.inverse(_motion_between(ends)) @ T_first_last)
             cost[row] += np.sum((error[3:] / _NOISE_M) ** 2) + np.sum((error[:3] / _NOISE_RAD) ** 2)
     if not num_used:
         text = "the recording has too few poses before and after the sweeps looked at"
-        return finding("clock of poses", UNKNOWN, text)
-    likely_s = late_s[cost < cost.min() + _EVEN_COST]
-    low_s = float(likely_s.min())
-    high_s = float(likely_s.max())
-    best_s = float(late_s[np.argmin(cost)])
+        return Finding("clock of poses", UNKNOWN, text)
+    likely_s = late_s[cost < cost.min() + _EVEN_COST].tolist()
+    low_s, high_s, best_s = min(likely_s), max(likely_s), float(late_s[np.argmin(cost)])
     text = (
         f"odometry agrees best with the poses stamped {best_s * 1e3:+.0f} ms "
         f"({low_s * 1e3:+.0f} to {high_s * 1e3:+.0f}) later"
     )
-    verdict = FINE
-    remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
+    verdict, note = FINE, ""
     if high_s - low_s > _WIDEST_CLOCK_S:
-        verdict = UNKNOWN
-        text += "; the vehicle drives too evenly to tell"
+        verdict, note = UNKNOWN, "; the vehicle drives too evenly to tell"
     elif low_s > _CLOCK_OFF_S or high_s < -_CLOCK_OFF_S:
         verdict = SUSPICIOUS
+    remedy = f"shift the poses' stamps by {-best_s * 1e3:+.0f} ms"
     values = {"late_s": best_s, "low_s": low_s, "high_s": high_s}
-    return finding("clock of poses", verdict, text, remedy, **values)
+    return Finding("clock of poses", verdict, text + note, remedy, values)
 
 
 def _poses_around(sample: Sample, first_ns: int, last_ns: int) -> PoseTrack | None:

@@ -49,12 +49,9 @@ class Finding:
     remedy: str = ""
     values: Mapping[str, Value] = field(default_factory=dict)  # name (with unit) -> measured number
 
-
-def finding(
-    check: str, verdict: Verdict, evidence: str, remedy: str = "", **values: Value
-) -> Finding:
-    """Return a finding, with the remedy only if the verdict is SUSPICIOUS or WRONG."""
-    return Finding(check, verdict, evidence, remedy if verdict >= SUSPICIOUS else "", values)
+    def __post_init__(self) -> None:
+        if self.verdict < SUSPICIOUS:
+            object.__setattr__(self, "remedy", "")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, finding
+from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample
 from densify.free_space.raw_sweeps import (
     LOST_DEG,
     MAP_FRAME_REMEDY,
@@ -14,7 +14,7 @@ from densify.free_space.raw_sweeps import (
     lost_deg,
 )
 from densify.geometry.types import Float, Sweep
-from densify.readers.timeline import Timeline, format_frames
+from densify.readers.timeline import format_frames
 
 _SHORT = 0.3  # a file below this share of the usual size is short
 _FETCH = "fetch these files again; windows end before sweeps that cannot be read"
@@ -62,7 +62,7 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
             f"{len(sample.unreadable)} of the sweeps looked at cannot be read: frames "
             f"{format_frames(sample.unreadable)}; frame {frame}: {reason}"
         )
-        findings.append(finding("reading", WRONG, text, _FETCH))
+        findings.append(Finding("reading", WRONG, text, _FETCH))
     sequence = sample.sequence
     sizes = sequence.sweep_bytes() if hasattr(sequence, "sweep_bytes") else {}
     if sizes:
@@ -77,7 +77,7 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
             )
         verdict = WRONG if empty else SUSPICIOUS if short else FINE
         values = {"num_empty": len(empty), "num_short": len(short), "usual_bytes": int(usual)}
-        findings.append(finding("files", verdict, text, _FETCH, **values))
+        findings.append(Finding("files", verdict, text, _FETCH, values))
     return findings
 
 
@@ -93,9 +93,9 @@ def check_stamps(sample: Sample) -> list[Finding]:
             f"first of them frame {frame} ({reason})"
         )
         remedy = "correct the stamps of these sweeps, or remove their files"
-        return [finding("stamps", WRONG, text, remedy)]
+        return [Finding("stamps", WRONG, text, remedy)]
     if len(frames) < 2:
-        return [finding("stamps", UNKNOWN, "one sweep tells no rate")]
+        return [Finding("stamps", UNKNOWN, "one sweep tells no rate")]
     backward = np.flatnonzero(step_ns <= 0)
     if len(backward):
         row = int(backward[0])
@@ -105,83 +105,73 @@ def check_stamps(sample: Sample) -> list[Finding]:
             f"{frames[row]}"
         )
         remedy = "sort the sweeps by their stamps, or correct the file of stamps"
-        return [finding("stamps", WRONG, text, remedy, num_backward=len(backward))]
-    return [_check_rate(timeline.period_ns * 1e-9), *_check_holes(timeline)]
-
-
-def _check_holes(timeline: Timeline) -> list[Finding]:
-    """Report holes in time between sweeps, if there are any."""
-    frames = timeline.frames
-    step_ns = np.diff(timeline.stamp_ns)
+        return [Finding("stamps", WRONG, text, remedy, {"num_backward": len(backward)})]
+    findings = [_check_rate(timeline.period_ns * 1e-9)]
     holes = np.flatnonzero(step_ns > _HOLE_PERIODS * timeline.period_ns)
-    if not len(holes):
-        return []
-    longest = int(holes[np.argmax(step_ns[holes])])
-    text = (
-        f"{len(holes)} of more than three periods, the longest of {step_ns[longest] * 1e-9:.1f} "
-        f"s after frame {frames[longest]}; windows end there (after frames "
-        f"{format_frames(frames[row] for row in holes)})"
-    )
-    remedy = "nothing, if the sweeps were never recorded; else fetch them again"
-    return [finding("holes in time", SUSPICIOUS, text, remedy, num_holes=len(holes))]
+    if len(holes):
+        longest = int(holes[np.argmax(step_ns[holes])])
+        text = (
+            f"{len(holes)} of more than three periods, the longest of "
+            f"{step_ns[longest] * 1e-9:.1f} s after frame {frames[longest]}; windows end there "
+            f"(after frames {format_frames(frames[row] for row in holes)})"
+        )
+        remedy = "nothing, if the sweeps were never recorded; else fetch them again"
+        findings.append(
+            Finding("holes in time", SUSPICIOUS, text, remedy, {"num_holes": len(holes)})
+        )
+    return findings
 
 
 def _check_rate(period_s: float) -> Finding:
     """Check that the period of the sweeps is that of an existing scanner."""
     least_s, most_s = _PERIODS_S
+    values = {"period_s": period_s}
     if least_s <= period_s <= most_s:
-        return finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", period_s=period_s)
+        return Finding("stamps", FINE, f"{1 / period_s:.2f} Hz, ascending", values=values)
     text = f"from sweep to sweep {period_s:.3g} s pass, expected {least_s} to {most_s} s"
-    mistakes = [
-        mistake
-        for mistake, factor in _STAMP_UNITS.items()
-        if least_s <= period_s * factor <= most_s
-    ]
-    if mistakes:
-        rate_hz = 1 / (period_s * _STAMP_UNITS[mistakes[0]])
-        text += f"; it would be {rate_hz:.1f} Hz with {mistakes[0]}"
-    verdict = WRONG if mistakes else SUSPICIOUS
-    return finding("stamps", verdict, text, "correct the unit of the stamps", period_s=period_s)
+    verdict = SUSPICIOUS
+    for mistake, factor in _STAMP_UNITS.items():
+        if least_s <= period_s * factor <= most_s:
+            verdict = WRONG
+            text += f"; it would be {1 / (period_s * factor):.1f} Hz with {mistake}"
+            break
+    return Finding("stamps", verdict, text, "correct the unit of the stamps", values)
 
 
 def check_point_times(sample: Sample) -> list[Finding]:
     """Check that the firing times within a sweep span about one period."""
     if any(sweep.offset_ns is None for sweep in sample.middles):
-        return [finding("point times", UNKNOWN, "the points have no times")]
+        return [Finding("point times", UNKNOWN, "the points have no times")]
     if len(sample.timeline.frames) < 2:
-        return [finding("point times", UNKNOWN, "one sweep tells no period to compare with")]
+        return [Finding("point times", UNKNOWN, "one sweep tells no period to compare with")]
     return [_check_point_times_of(sample, lidar) for lidar in sample.lidars]
 
 
 def _check_point_times_of(sample: Sample, lidar: int) -> Finding:
     """Check the firing times of one scanner."""
-    period_s = sample.timeline.period_ns * 1e-9
-    offsets_s = [
-        sweep.offset_ns[sweep.lidar == lidar] * 1e-9
-        for sweep in sample.middles
-        if sweep.offset_ns is not None
-    ]
-    # The first and the last 0.1 % may be stray.
-    ends_s = [np.percentile(offset_s, [0.1, 99.9]) for offset_s in offsets_s if len(offset_s)]
+    ends_s = []
+    for sweep in sample.middles:
+        is_of_lidar = sweep.lidar == lidar
+        if sweep.offset_ns is not None and is_of_lidar.any():
+            # The first and the last 0.1 % may be stray.
+            ends_s.append(np.percentile(sweep.offset_ns[is_of_lidar] * 1e-9, [0.1, 99.9]))
     low_s, high_s = np.median(ends_s, axis=0).tolist()
-    span = (high_s - low_s) / period_s
-    share_before = -low_s / max(high_s - low_s, 1e-12)
+    span_s = high_s - low_s
+    span = span_s / (sample.timeline.period_ns * 1e-9)
     text = (
         f"{low_s * 1e3:+.1f} to {high_s * 1e3:+.1f} ms around the stamp, {span:.3g} periods; "
-        f"the stamp is at {round(100 * share_before)} % of the sweep"
+        f"the stamp is at {round(100 * -low_s / max(span_s, 1e-12))} % of the sweep"
     )
-    verdict = SUSPICIOUS
-    remedy = "compare the point times with the scanner's rate"
+    verdict, remedy = SUSPICIOUS, "compare the point times with the scanner's rate"
     if _WHOLE_SWEEP[0] <= span <= _WHOLE_SWEEP[1]:
         verdict = FINE
-    elif span < 1 and _TURN_S[0] <= high_s - low_s <= _TURN_S[1]:
+    elif span < 1 and _TURN_S[0] <= span_s <= _TURN_S[1]:
         verdict = FINE
         text += f"; one of {round(1 / span)} turns of the scanner was kept"
     elif not _WRONG_SPAN[0] <= span <= _WRONG_SPAN[1]:
-        verdict = WRONG
-        remedy = "correct the unit of the point times"
+        verdict, remedy = WRONG, "correct the unit of the point times"
     name = "point times" + f" of scanner {lidar}" * (lidar > 0)
-    return finding(name, verdict, text, remedy, first_s=low_s, last_s=high_s)
+    return Finding(name, verdict, text, remedy, {"first_s": low_s, "last_s": high_s})
 
 
 def check_units(sample: Sample) -> list[Finding]:
@@ -192,7 +182,7 @@ def check_units(sample: Sample) -> list[Finding]:
     range_m = float(np.median([_median_range_m(points) for points in clouds]))
     if least_m <= range_m <= most_m:
         text = f"half of the returns within {range_m:.1f} m"
-        return [finding(name, FINE, text, median_range_m=range_m)]
+        return [Finding(name, FINE, text, values={"median_range_m": range_m})]
 
     # Points in a map's coordinates are far from the origin, but close to each other.
     spreads_m = [_median_range_m(points - np.median(points, axis=0)) for points in clouds]
@@ -201,19 +191,18 @@ def check_units(sample: Sample) -> list[Finding]:
         unit for unit, factor in _LENGTH_UNITS.items() if least_m <= range_m * factor <= most_m
     ]
     text = f"half of the returns are farther than {range_m:.4g} m"
-    verdict = SUSPICIOUS
+    verdict = WRONG
     remedy = "scale the points to metres (sweeps: scale_m in densify.yaml)"
     if least_m <= spread_m <= most_m and range_m > _FAR_OFF * spread_m:
         text += f", and within {spread_m:.1f} m of each other's middle, as if they were in a map's"
         text += " coordinates"
-        verdict = WRONG
         remedy = MAP_FRAME_REMEDY
+    elif units:
+        text += f", expected {least_m} to {most_m:.0f} m, as if they were in {units[0]}"
     else:
         text += f", expected {least_m} to {most_m:.0f} m"
-        if units:
-            verdict = WRONG
-            text += f", as if they were in {units[0]}"
-    return [finding(name, verdict, text, remedy, median_range_m=range_m)]
+        verdict = SUSPICIOUS
+    return [Finding(name, verdict, text, remedy, {"median_range_m": range_m})]
 
 
 def _median_range_m(points: Float) -> float:
@@ -237,14 +226,13 @@ def check_axes(sample: Sample) -> list[Finding]:
     verdict = WRONG
     remedy = "turn the points so that z is up (sweeps: axes in densify.yaml)"
     if shares[best] < _LEAST_GROUND:
-        verdict = UNKNOWN
-        text = "no ground was found along any axis"
+        verdict, text = UNKNOWN, "no ground was found along any axis"
     elif shares["z"] >= _LEAST_GROUND or shares[best] < _CLEARLY * shares["z"]:
         verdict = FINE
     elif best in _UP_MEANS:
         text += f" ({_UP_MEANS[best]})"
     values = {f"share_{axis}": share for axis, share in shares.items()}
-    return [finding("axes", verdict, text, remedy, **values)]
+    return [Finding("axes", verdict, text, remedy, values)]
 
 
 def _ground_share(sweep: Sweep, up: Float) -> float:
@@ -282,22 +270,21 @@ def check_directions(sample: Sample) -> list[Finding]:
             f"measured"
         )
         remedy = "lost packets: record with a larger buffer of the socket, or leave sweeps out"
-        return [finding(name, SUSPICIOUS, text, remedy, lost_deg=widest_deg)]
+        return [Finding(name, SUSPICIOUS, text, remedy, {"lost_deg": widest_deg})]
     if sectors[0] is not None and None not in sectors:
         text = f"no returns from {sectors[0][0]} to {sectors[0][1]} deg of azimuth in any sweep"
         remedy = "a blind sector: something covers the scanner, or the sweeps were cropped"
-        return [finding(name, SUSPICIOUS, text, remedy)]
-    return [finding(name, FINE, "returns all around, as far as the scanner sees")]
+        return [Finding(name, SUSPICIOUS, text, remedy)]
+    return [Finding(name, FINE, "returns all around, as far as the scanner sees")]
 
 
 def check_intensity(sample: Sample) -> list[Finding]:
     """Check that intensities are between 0 and 1."""
     values = np.concatenate([sweep.intensity for sweep in sample.middles])
     low, high = float(values.min()), float(values.max())
-    verdict = FINE
-    text = f"{low:g} to {high:g}"
+    verdict, note = FINE, ""
     if low < 0 or high > 1:
-        verdict = SUSPICIOUS
-        text += ", expected 0 to 1; only pictures and the clouds' column suffer"
+        verdict, note = SUSPICIOUS, ", expected 0 to 1; only pictures and the clouds' column suffer"
+    text = f"{low:g} to {high:g}{note}"
     remedy = "scale the intensities (sweeps: intensity_scale in densify.yaml)"
-    return [finding("intensity", verdict, text, remedy, lowest=low, highest=high)]
+    return [Finding("intensity", verdict, text, remedy, {"lowest": low, "highest": high})]

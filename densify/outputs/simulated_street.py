@@ -20,8 +20,7 @@ from densify.readers import checks
 from densify.readers.folder_config import NAME
 from densify.readers.kitti import KITTI_TRIGGER_LATENCY_NS
 from densify.readers.recorded_poses import PoseTrack
-from densify.readers.street import Street
-from densify.readers.truth_files import write_bodies, write_depth, write_points
+from densify.readers.street import Street, write_bodies, write_depth, write_points
 from densify.street.cameras import CAMERAS, T_RECTIFIED_LIDAR, USUAL, T_level_lidar
 from densify.street.lidar import SENSORS
 from densify.street.simulator import EPOCH_NS, Bodies

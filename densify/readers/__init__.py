@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -96,7 +96,7 @@ def open_sequence(spec: str | Path = "street") -> LidarSequence:
         raise InputError(
             f"data {spec}: {reader.name} recordings have no scenes; leave #{parsed.scene} out"
         )
-    module = cast(ReaderModule, reader.load_module())
+    module: ReaderModule = reader.load_module()
     sequence = module.open_recording(parsed.path, parsed.scene)
     if isinstance(sequence, FileSequence):
         sequence.check_first_images()
@@ -118,9 +118,13 @@ def _reader_of(parsed: Spec, where: str) -> Plugin:
     for reader in readers:
         if reader.recognises(parsed.path):
             return reader
-    inside = _recording_in(parsed.path, readers)
-    if inside is not None:
-        raise InputError(f"{where}: no recording itself; one in it is {inside}: name that")
+    # A recording inside, at most two levels down. Links may lead nowhere.
+    entries = [*parsed.path.glob("*"), *parsed.path.glob("*/*")][:_MOST_ENTRIES]
+    entries = sorted(entry for entry in entries if entry.exists())
+    for reader in readers:
+        for entry in entries:
+            if reader.recognises(entry):
+                raise InputError(f"{where}: no recording itself; one in it is {entry}: name that")
     raise InputError(
         f"{where}: no recording: {_what_is_there(parsed.path)}; expected one of the readers "
         f"{', '.join(reader.name for reader in readers)} (densify info --help says what each reads)"
@@ -132,23 +136,12 @@ def _what_is_there(path: Path) -> str:
     if path.is_file():
         return f"it is a {path.suffix or 'file without a suffix'} file"
     counts = Counter(entry.suffix.lower() or "other" for entry in path.iterdir() if entry.is_file())
-    contents = [f"{num} {suffix} file{'s' * (num > 1)}" for suffix, num in counts.most_common(3)]
-    num_folders = sum(entry.is_dir() for entry in path.iterdir())
-    contents += [f"{num_folders} folder{'s' * (num_folders > 1)}"] * bool(num_folders)
-    text = f"it holds {', '.join(contents)}, no lidar sweeps" if contents else "it is empty"
+    kinds = [(f"{suffix} file", num) for suffix, num in counts.most_common(3)]
+    kinds.append(("folder", sum(entry.is_dir() for entry in path.iterdir())))
+    contents = ", ".join(f"{num} {kind}{'s' * (num > 1)}" for kind, num in kinds if num)
+    text = f"it holds {contents}, no lidar sweeps" if contents else "it is empty"
     drive = drive_around(path)
     return text if drive is None else f"{text}, and is inside a KITTI drive: give {drive}"
-
-
-def _recording_in(path: Path, readers: Sequence[Plugin]) -> Path | None:
-    """Return the first recording in a folder, at most two levels down; None without one."""
-    entries = [*path.glob("*"), *path.glob("*/*")][:_MOST_ENTRIES] if path.is_dir() else []
-    entries = [entry for entry in sorted(entries) if entry.exists()]  # links may lead nowhere
-    recordings = (entry for reader in readers for entry in entries if reader.recognises(entry))
-    return next(recordings, None)
-
-
-# --- descriptions ---------------------------------------------------------------------------------
 
 
 def describe(sequence: LidarSequence) -> str:
@@ -175,9 +168,12 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
     num_points = {sweep.frame: _num_points(sweep) for sweep in (first, last)}
     named = sorted(unreadable)[:_MOST_NAMED]
     length_s = (last.stamp_ns - first.stamp_ns) * 1e-9
+    frames = sequence.frames
+    num_missing = frames[-1] - frames[0] + 1 - len(frames)
+    gaps = f"{num_missing} missing between them" if num_missing else "no gaps"
     lines = [
         ("name", sequence.name),
-        ("frames", _frames(sequence)),
+        ("frames", f"{format_frames(frames)} ({len(frames)}, {gaps})"),
         ("rate", _hertz(timeline.stamp_ns) if len(timeline.frames) > 1 else "unknown, one sweep"),
         ("stamps", f"{first.stamp_ns} to {last.stamp_ns} ns ({length_s:.2f} s)"),
         ("points", ", ".join(f"{num} in frame {f}" for f, num in num_points.items())),
@@ -202,14 +198,6 @@ def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[i
         except InputError as error:
             unreadable[frame] = str(error)
     raise InputError(unreadable[frames[0]])
-
-
-def _frames(sequence: LidarSequence) -> str:
-    """Describe the frame numbers, how many there are, and how many are missing."""
-    frames = sequence.frames
-    num_missing = frames[-1] - frames[0] + 1 - len(frames)
-    gaps = f", {num_missing} missing between them" if num_missing else ", no gaps"
-    return f"{format_frames(frames)} ({len(frames)}{gaps})"
 
 
 def _hertz(stamps_ns: Sequence[int] | Int) -> str:

@@ -149,7 +149,7 @@ def truth_beside(recording: Path) -> Truth | None:
     """Return the ground truth in a simulated recording's folder ``truth``, None if none exists."""
     if not (recording / "truth").is_dir():
         return None
-    from densify.readers.truth_files import FileTruth
+    from densify.readers.street import FileTruth
 
     return FileTruth(recording / "truth")
 

@@ -130,17 +130,16 @@ def _depth_files(path: Path, argument: str) -> list[_File]:
         return [_File.parse(path)]
     # Hidden files are unfinished results. Exported maps are copies of the maps beside them.
     exported = {p.parent for p in path.rglob("export.yaml")} - {path}
-    images = [
-        image
+    files = [
+        _File.parse(image)
         for image in sorted(path.rglob("*.png"))
         if "/." not in f"/{image.relative_to(path).as_posix()}"
         and not exported.intersection(image.parents)
     ]
-    if not images:
+    if not files:
         raise InputError(
             f"{argument} {path}: no such file or folder with PNG files, expected depth maps"
         )
-    files = [_File.parse(image) for image in images]
     return [file for file in files if file.product is not None] or files
 
 
@@ -165,14 +164,12 @@ def _match(
     left: Sequence[_File], right: Sequence[_File], left_path: Path, right_path: Path
 ) -> dict[Path, Path]:
     """Return right -> left path where frames agree, and drive and camera too if all name them."""
-    files = (*left, *right)
-    shared = [
-        name
-        for name in ("drive", "camera")
-        if all(getattr(file, name) is not None for file in files)
-    ]
-    left_by_key = _keyed(left, ["frame", *shared], left_path)
-    right_by_key = _keyed(right, ["frame", *shared], right_path)
+    names = ["frame"]
+    for name in ("drive", "camera"):
+        if all(getattr(file, name) is not None for file in (*left, *right)):
+            names.append(name)
+    left_by_key = _keyed(left, names, left_path)
+    right_by_key = _keyed(right, names, right_path)
     return {path: left_by_key[key] for key, path in right_by_key.items() if key in left_by_key}
 
 

@@ -11,6 +11,7 @@ Each has a pose. Points have no times and are in the sensor's frame. Images have
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from datetime import datetime, timedelta, timezone
 from os.path import isfile
@@ -53,13 +54,6 @@ class _Datum(NamedTuple):
     size_px: tuple[int, int]  # width and height of an image
 
 
-class _Mount(NamedTuple):
-    """The calibration of a sensor."""
-
-    T_ego_sensor: Float  # (4,4) pose of the sensor in the vehicle's frame
-    fx_fy_cx_cy: list[float]  # pixels
-
-
 class Dgp(FileSequence):
     """A DGP scene as a `LidarSequence`, with poses of its images."""
 
@@ -69,18 +63,17 @@ class Dgp(FileSequence):
         lidar = min(sweeps)
         self._sweeps = sweeps[lidar]
         self._stamps_ns = {number: sweep.stamp_ns for number, sweep in self._sweeps.items()}
-        mounts = _read_calibration(calibration)
-        missing = [name for name in (lidar, *self._images) if name not in mounts]
+        T_ego_sensor, lenses = _read_calibration(calibration)
+        missing = [name for name in (lidar, *self._images) if name not in lenses]
         if missing:
             raise InputError(
-                f"{calibration}: no calibration of {missing[0]}; got {', '.join(map(str, mounts))}"
+                f"{calibration}: no calibration of {missing[0]}; got {', '.join(map(str, lenses))}"
             )
-        T_ego_lidar, cameras = mounts[lidar].T_ego_sensor, {}
+        T_ego_lidar, cameras = T_ego_sensor[lidar], {}
         for name, data in self._images.items():
             size_px, where = next(iter(data.values())).size_px, f"{calibration}: {name}"
-            T_cam_lidar = poses.inverse(mounts[name].T_ego_sensor) @ T_ego_lidar
-            lens = mounts[name].fx_fy_cx_cy
-            cameras[name] = checks.pinhole(name, size_px, lens, T_cam_lidar, where)
+            T_cam_lidar = poses.inverse(T_ego_sensor[name]) @ T_ego_lidar
+            cameras[name] = checks.pinhole(name, size_px, lenses[name], T_cam_lidar, where)
         # DDAD merges several solid-state scanners into the vehicle's frame, with its origin on the
         # ground, and does not publish the origin of the rays. Scan lines are smoothest as seen from
         # 1.55 m above the ground: the mean position of the cameras is used.
@@ -128,27 +121,26 @@ _Numbered = dict[str, dict[int, _Datum]]
 def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
     """Return sweeps and images, by sensor and number, and the path of the calibration file."""
     content = read_json(file)
-    numbered_of_kind: dict[str, _Numbered] = {"point_cloud": {}, "image": {}}
+    sweeps: _Numbered = defaultdict(dict)
+    images: _Numbered = defaultdict(dict)
     with described_in(file, "a DGP scene with samples and their data"):
         data = {entry["key"]: entry for entry in content["data"]}
         keys = {key for sample in content["samples"] for key in sample["datum_keys"]}
-        last_number: dict[str, int] = {}  # last used number, by sensor
+        next_number: Counter[str] = Counter()  # by sensor
         entries = (data[key] for key in keys)
         for entry in sorted(entries, key=lambda entry: entry["id"]["timestamp"]):
             kind = next(iter(entry["datum"]))
             name = entry["id"]["name"]
-            number = last_number.get(name, -1) + 1
-            last_number[name] = number
-            if kind in numbered_of_kind:
+            if kind in ("point_cloud", "image"):
                 datum = _datum(file, kind, entry)
                 if isfile(datum.path):
-                    numbered_of_kind[kind].setdefault(name, {})[number] = datum
+                    (images if kind == "image" else sweeps)[name][next_number[name]] = datum
+            next_number[name] += 1
         key = content["samples"][0]["calibration_key"]
-    if not numbered_of_kind["point_cloud"]:
+    if not sweeps:
         raise InputError(f"{file}: none of its sweeps is there; expected point_cloud/LIDAR/*.npz")
-    images = dict(sorted(numbered_of_kind["image"].items()))
     calibration = checks.file_within(file.parent, f"calibration/{key}.json", file)
-    return numbered_of_kind["point_cloud"], images, calibration
+    return sweeps, dict(sorted(images.items())), calibration
 
 
 def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
@@ -175,12 +167,12 @@ def _read_pose(pose: Mapping[str, Any], where: str) -> Float:
     return checks.quaternion_pose(quaternion, [translation[key] for key in "xyz"], where)
 
 
-def _read_calibration(file: Path) -> dict[str, _Mount]:
-    """Return the calibration of each sensor by its name."""
-    content, mounts = read_json(file), {}
+def _read_calibration(file: Path) -> tuple[dict[str, Float], dict[str, list[float]]]:
+    """Return T_ego_sensor (4,4), and fx fy cx cy in pixels, of each sensor by its name."""
+    content, T_ego_sensor, lenses = read_json(file), {}, {}
     with described_in(file, "names, and extrinsics and intrinsics of each"):
         sensors = zip(content["names"], content["extrinsics"], content["intrinsics"], strict=True)
         for name, extrinsic, lens in sensors:
-            T = _read_pose(extrinsic, f"{file}: extrinsics of {name}")
-            mounts[name] = _Mount(T, [float(lens[key]) for key in ("fx", "fy", "cx", "cy")])
-    return mounts
+            T_ego_sensor[name] = _read_pose(extrinsic, f"{file}: extrinsics of {name}")
+            lenses[name] = [float(lens[key]) for key in ("fx", "fy", "cx", "cy")]
+    return T_ego_sensor, lenses

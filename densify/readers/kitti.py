@@ -68,12 +68,8 @@ _SMALLEST_IMAGE_PX = (1224, 370)  # of the tracking data set
 _T_CAM_UPRIGHT = np.array(  # from x right, y forward, z up
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-_IMAGES_360 = {
-    "image_00": "data_rect",
-    "image_01": "data_rect",
-    "image_02": "data_rgb",
-    "image_03": "data_rgb",
-}
+_RECTIFIED_360 = ("image_00", "image_01")
+_FISHEYES_360 = ("image_02", "image_03")
 
 
 def open_recording(path: Path, scene: str | None) -> Drive:
@@ -113,10 +109,10 @@ class Drive(FileSequence):
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
         numbered = {
-            camera: checks.numbered_files(folder, ".png", ".jpg", ".jpeg")
+            camera: numbers
             for camera, folder in images.items()
+            if (numbers := checks.numbered_files(folder, ".png", ".jpg", ".jpeg"))
         }
-        numbered = {camera: numbers for camera, numbers in numbered.items() if numbers}
         super().__init__(name, where, tuple(files), files=files, images=numbered)
         self._stamps = stamps
         self._exposed_ns = {camera: stamps.of(numbers) for camera, numbers in numbered.items()}
@@ -135,11 +131,15 @@ class Drive(FileSequence):
         points, intensity = read_points(self._files[frame])
         return Returns(points, intensity, turned_ns(points, self._stamps.period_ns))
 
-    def _first_sizes_px(self) -> dict[str, tuple[int, int]]:
-        """Return width and height (px) of the first image of each camera."""
+    def _rectified_cameras(
+        self, calibration: Calibration, T_rect_lidar: Float
+    ) -> dict[str, Camera]:
+        """Return the cameras with images, which are rectified and as large as the first image."""
         return {
-            camera: image_size_px(min(files.values()))
-            for camera, files in self._image_files.items()
+            name: calibration.rectified_camera(
+                f"P{name[-1]}", name, image_size_px(min(files.values())), T_rect_lidar
+            )
+            for name, files in self._image_files.items()
         }
 
 
@@ -160,11 +160,8 @@ class KittiRaw(Drive):
         self._missing = [file.path.name for file in recorded if not file.by_frame]
         if self._missing == [stamps.path.name]:
             start_ns, end_ns = self._start.by_frame, self._end.by_frame
-            middle_ns = {
-                frame: (start_ns[frame] + end_ns[frame]) // 2
-                for frame in start_ns
-                if frame in end_ns
-            }
+            both = [frame for frame in start_ns if frame in end_ns]
+            middle_ns = {frame: (start_ns[frame] + end_ns[frame]) // 2 for frame in both}
             stamps = Stamps(stamps.path, middle_ns)
         images = {name: drive / name / "data" for name in cameras}
         sweeps = drive / "velodyne_points" / "data"
@@ -173,13 +170,11 @@ class KittiRaw(Drive):
         self.truth = checks.truth_beside(drive)
         # Exposures of the images; those without a stamp keep the stamp of the sweep.
         for name, numbers in self._image_files.items():
-            recorded_ns = read_stamps(drive / name / "timestamps.txt", required=False)
-            exposed_ns = {
-                frame: stamp_ns - KITTI_TRIGGER_LATENCY_NS
-                for frame, stamp_ns in recorded_ns.by_frame.items()
-            }
-            exposed_ns = {**self._exposed_ns[name], **exposed_ns}
-            self._exposed_ns[name] = Stamps(recorded_ns.path, exposed_ns).of(numbers)
+            image_stamps = read_stamps(drive / name / "timestamps.txt", required=False)
+            exposed_ns = dict(self._exposed_ns[name])
+            for frame, stamp_ns in image_stamps.by_frame.items():
+                exposed_ns[frame] = stamp_ns - KITTI_TRIGGER_LATENCY_NS
+            self._exposed_ns[name] = Stamps(image_stamps.path, exposed_ns).of(numbers)
         self._oxts = checks.numbered_files(drive / "oxts" / "data", ".txt")
 
     def gaps(self) -> list[str]:
@@ -187,10 +182,10 @@ class KittiRaw(Drive):
         velodyne = self.where / "velodyne_points"
         notes = [f"{velodyne} has no {', '.join(self._missing)}"] * bool(self._missing)
         notes += super().gaps()
-        left_out = [name for name in _image_folders(self.where) if name not in self.cameras]
         return notes + [
             f"{name} is left out: calib_cam_to_cam.txt has no P_rect_{name[-2:]}"
-            for name in left_out
+            for name in _image_folders(self.where)
+            if name not in self.cameras
         ]
 
     def _returns(self, frame: int) -> Returns:
@@ -223,14 +218,9 @@ class KittiRaw(Drive):
         return track.at(self.stamp_ns(frame)) @ T_imu_lidar
 
     def _T_world_imu(self, frame: int) -> Float:
-        return T_first_imu(self._first_record, self._record(frame))
-
-    def _record(self, frame: int) -> Float:
-        return parse_oxts(read_text(self._oxts[frame]), str(self._oxts[frame]))
-
-    @cached_property
-    def _first_record(self) -> Float:
-        return self._record(min(self._oxts))
+        paths = self._oxts[min(self._oxts)], self._oxts[frame]
+        first, record = (parse_oxts(read_text(path), str(path)) for path in paths)
+        return T_first_imu(first, record)
 
     @cached_property
     def _oxts_stamps(self) -> Stamps:
@@ -286,12 +276,9 @@ class KittiOdometry(Drive):
         stamps = Stamps(times, dict(enumerate(times_ns)))
         super().__init__(path.resolve().name, path, path / "velodyne", stamps, images)
         self.truth = checks.truth_beside(path)
-        self.cameras = {
-            name: self._calibration.rectified_camera(
-                f"P{name[-1]}", name, size_px, self._calibration.motion("Tr")
-            )
-            for name, size_px in self._first_sizes_px().items()
-        }
+        if self._image_files:
+            T_cam_lidar = self._calibration.motion("Tr")
+            self.cameras = self._rectified_cameras(self._calibration, T_cam_lidar)
 
     def _returns(self, frame: int) -> Returns:
         stored, intensity = read_points(self._files[frame])
@@ -344,10 +331,8 @@ class KittiTracking(Drive):
         super().__init__(name, path, path / "velodyne" / scene, stamps, images)
         self._scene_file = f"{scene}.txt"
         self.truth = checks.truth_beside(path)
-        sizes_px = self._first_sizes_px()
-        self.cameras = {
-            camera: self._camera(camera, size_px) for camera, size_px in sizes_px.items()
-        }
+        if self._image_files:
+            self.cameras = self._rectified_cameras(self._calibration, self._T_rect_lidar)
 
     def _pose(self, frame: int) -> Float:
         path = self.where / "oxts" / self._scene_file
@@ -378,7 +363,9 @@ class KittiTracking(Drive):
         size_m = np.column_stack([length_m, width_m, height_m])
         tracks = [f"{track:.0f}" for track in labels[:, 1]]
         checked = checks.boxes(tracks, T_lidar_box, size_m, f"{path}: frame {frame}")
-        camera = self.cameras.get("image_02") or self._camera("image_02", _SMALLEST_IMAGE_PX)
+        camera = self.cameras.get("image_02") or self._calibration.rectified_camera(
+            "P2", "image_02", _SMALLEST_IMAGE_PX, self._T_rect_lidar
+        )
         offset_ns = turned_ns(T_lidar_box[:, :3, 3], NOMINAL_PERIOD_NS)
         return replace(checked, offset_ns=offset_ns, view=BoxView(camera, areas_px))
 
@@ -391,9 +378,6 @@ class KittiTracking(Drive):
         """The (4,4) transform from the lidar frame to the frame of rectified camera 0."""
         return self._calibration.rotation("R_rect") @ self._calibration.motion("Tr_velo_cam")
 
-    def _camera(self, name: str, size_px: tuple[int, int]) -> Camera:
-        return self._calibration.rectified_camera(f"P{name[-1]}", name, size_px, self._T_rect_lidar)
-
 
 class Kitti360(Drive):
     """A KITTI-360 drive as a `LidarSequence`, stamped at the middle of the revolution.
@@ -405,7 +389,8 @@ class Kitti360(Drive):
     def __init__(self, path: Path, drive: str) -> None:
         velodyne = path / "data_3d_raw" / drive / "velodyne_points"
         folder = path / "data_2d_raw" / drive
-        images = {name: folder / name / kind for name, kind in _IMAGES_360.items()}
+        images = {name: folder / name / "data_rect" for name in _RECTIFIED_360}
+        images |= {name: folder / name / "data_rgb" for name in _FISHEYES_360}
         stamps = read_stamps(velodyne / "timestamps.txt")
         super().__init__(drive, path, velodyne / "data", stamps, images)
         self.truth = checks.truth_beside(velodyne.parent)
@@ -449,7 +434,7 @@ class Kitti360(Drive):
     def _camera(self, name: str) -> Camera:
         folder, number = self.where / "calibration", name[-2:]
         T_cam_lidar = poses.inverse(self._to_pose.motion(name)) @ self._T_pose_lidar
-        if _IMAGES_360[name] == "data_rgb":
+        if name in _FISHEYES_360:
             return read_fisheye(folder / f"{name}.yaml", name, T_cam_lidar)
         perspective = Calibration.read(folder / "perspective.txt")
         size = f"S_rect_{number}"

@@ -74,7 +74,7 @@ class Stamps:
 
     @property
     def period_ns(self) -> int:
-        """Median time between consecutive stamps in nanoseconds; 100 ms for fewer than two."""
+        """Median time (ns) between consecutive stamps; 100 ms for fewer than two."""
         steps_ns = np.diff(list(self.by_frame.values()))
         return int(np.median(steps_ns)) if len(steps_ns) else NOMINAL_PERIOD_NS
 
@@ -195,16 +195,9 @@ def read_fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
         pinhole = [projection[key] for key in ("gamma1", "gamma2", "u0", "v0")]
         words = [content["image_width"], content["image_height"], *pinhole, *lens]
     width, height, *numbers = checks.parse_numbers(" ".join(map(str, words)), str(path), 11)
-    return checks.pinhole(
-        name,
-        (int(width), int(height)),
-        numbers[:4],
-        T_cam_lidar,
-        str(path),
-        distortion=tuple(map(float, numbers[4:])),
-        model="mei",
-        max_angle_deg=_HALF_VIEW_DEG,
-    )
+    size_px, distortion = (int(width), int(height)), tuple(map(float, numbers[4:]))
+    camera = checks.pinhole(name, size_px, numbers[:4], T_cam_lidar, str(path))
+    return replace(camera, distortion=distortion, model="mei", max_angle_deg=_HALF_VIEW_DEG)
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:

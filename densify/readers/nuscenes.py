@@ -21,7 +21,7 @@ import mmap
 import re
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from os.path import isfile
 from pathlib import Path
@@ -59,8 +59,9 @@ def stamp_ns(record: Record) -> int:
     return int(np.int64(int(record["timestamp"]) * 1000))
 
 
-def _pose_of(record: Record, where: str) -> Float:
-    """Return the (4,4) pose (m) of a record with a quaternion w x y z and a translation."""
+def _pose_of(record: Record, path: Path) -> Float:
+    """Return the (4,4) pose (m) of a record of the table at ``path``."""
+    where = f"{path}: record {record['token']}"
     return checks.quaternion_pose(record["rotation"], record["translation"], where)
 
 
@@ -129,14 +130,13 @@ class Annotations:
             boxes: dict[str, dict[str, KeyBox]] = {token: {} for token in order}
             for token, record in find_records(path, "sample_token", samples).items():
                 sample, instance = record["sample_token"], record["instance_token"]
-                where = f"{path}: record {token}"
                 if instance in boxes[sample]:
                     raise InputError(
-                        f"{where}: a second box of the instance {instance} in the sample {sample}, "
-                        f"expected one"
+                        f"{path}: record {token}: a second box of the instance {instance} in the "
+                        f"sample {sample}, expected one"
                     )
                 size_m = np.array(record["size"], np.float64)[_LENGTH_WIDTH_HEIGHT]
-                boxes[sample][instance] = KeyBox(_pose_of(record, where), size_m)
+                boxes[sample][instance] = KeyBox(_pose_of(record, path), size_m)
         key_ns = np.array([stamp_ns(samples[token]) for token in order], np.int64)
         return Annotations(str(path), key_ns, (*boxes.values(),)) if any(boxes.values()) else None
 
@@ -160,17 +160,13 @@ class Annotations:
         """Inter- or extrapolate an object's box between key frames ``before`` and ``after``."""
         # At constant velocity and turn rate, as in the devkit. An object in only one of the two is
         # extrapolated from its nearest motion; it gets no track name, as its position is unknown.
-        for first, last in ((before, after), (after, after + 1), (before - 1, before)):
-            boxes = [
-                boxes_of_key[instance]
-                for boxes_of_key in self.boxes[max(first, 0) : last + 1]
-                if instance in boxes_of_key
-            ]
-            if 0 <= first < last < len(self.boxes) and len(boxes) == 2:
-                span_ns = self.key_ns[last] - self.key_ns[first]
+        for first in (before, after, before - 1):
+            pair = [boxes.get(instance) for boxes in self.boxes[max(first, 0) : first + 2]]
+            if first >= 0 and len(pair) == 2 and pair[0] and pair[1]:
+                span_ns = self.key_ns[first + 1] - self.key_ns[first]
                 share = float((stamp_ns - self.key_ns[first]) / span_ns)
-                T = interpolate(boxes[0].T_world_box, boxes[1].T_world_box, share)
-                return KeyBox(T, boxes[share > 0.5].size_m)
+                T = interpolate(pair[0].T_world_box, pair[1].T_world_box, share)
+                return KeyBox(T, (pair[1] if share > 0.5 else pair[0]).size_m)
         return {**self.boxes[before], **self.boxes[after]}[instance]
 
 
@@ -213,26 +209,19 @@ def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseT
             f"{poses_file}: got {len(poses)} poses for {name}, expected the {len(wanted)} of its "
             f"{len(records)} records in sample_data.json"
         )
-    T_world_ego = {
-        stamp_ns(record): _pose_of(record, f"{poses_file}: record {token}")
-        for token, record in poses.items()
-    }
+    T_world_ego = {stamp_ns(pose): _pose_of(pose, poses_file) for pose in poses.values()}
     stamps_ns = sorted(T_world_ego)
     T = np.stack([T_world_ego[ns] for ns in stamps_ns])
     return records, PoseTrack(str(poses_file), np.array(stamps_ns, np.int64), T)
 
 
-Channels = dict[str, dict[int, Datum]]
-"""Sweeps or images by channel and number."""
-
-
-def _channels(tables: Path, records: Sequence[Record]) -> dict[str, Channels]:
-    """Return the channels by modality, from sample data records in the order of time."""
+def _channels(tables: Path, records: Sequence[Record]) -> dict[str, dict[str, dict[int, Datum]]]:
+    """Return sweeps and images by modality, channel and number; ``records`` ascend in time."""
     path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
     tokens = {record["calibrated_sensor_token"] for record in records}
-    T = {token: _pose_of(calibrated[token], f"{path}: record {token}") for token in tokens}
-    channels: dict[str, Channels] = defaultdict(lambda: defaultdict(dict))
+    T = {token: _pose_of(calibrated[token], path) for token in tokens}
+    channels: Any = defaultdict(lambda: defaultdict(dict))
     for record in records:
         token = record["calibrated_sensor_token"]
         sensor = sensors[calibrated[token]["sensor_token"]]
@@ -255,9 +244,9 @@ class NuScenes(FileSequence):
         with described_in(tables / "sample_data.json", _EXPECTED):
             records, self._ego = _read_path(tables, token, name)
             channels = _channels(tables, records)
-        lidars, names = channels["lidar"], sorted(channels["camera"])
-        names.sort(key=lambda name: name != _FIRST_CAMERA)
-        self._images = {name: channels["camera"][name] for name in names}
+        lidars, images = channels["lidar"], channels["camera"]
+        names = sorted(images, key=lambda name: (name != _FIRST_CAMERA, name))
+        self._images = {name: images[name] for name in names}
         if len(lidars) != 1:
             lidar_names = ", ".join(lidars) or "none"
             raise InputError(f"{root}: got the lidars {lidar_names} of {name}, expected one")
@@ -265,26 +254,26 @@ class NuScenes(FileSequence):
         self._T_ego_lidar = lidar[0].T_ego_sensor
         self._stamps_ns = {number: sweep.stamp_ns for number, sweep in lidar.items()}
         T_world_lidar = self._ego.T_world_ego @ self._T_ego_lidar
-        self._track = PoseTrack(self._ego.where, self._ego.stamp_ns, T_world_lidar)
+        self._track = replace(self._ego, T_world_ego=T_world_lidar)
         sweeps = _on_disk(lidar)
         if not sweeps:
             raise InputError(
                 f"{root}: none of the {len(lidar)} sweeps of {name} are there; expected files such "
                 f"as {lidar[0].path}"
             )
-        images = {channel: _on_disk(data) for channel, data in self._images.items()}
+        files = {camera: _on_disk(data) for camera, data in self._images.items()}
         super().__init__(
             name,
             root,
             list(sweeps),
             cameras={c: self._camera(c, data[0]) for c, data in self._images.items()},
             exposed_ns={
-                channel: {number: self._images[channel][number].stamp_ns for number in files}
-                for channel, files in images.items()
+                camera: {number: images[camera][number].stamp_ns for number in numbers}
+                for camera, numbers in files.items()
             },
             truth=checks.truth_beside(root),
             files=sweeps,
-            images=images,
+            images=files,
         )
 
     def _camera(self, name: str, image: Datum) -> Camera:

@@ -79,11 +79,10 @@ class PandaSet(FileSequence):
         step_m = np.pad(step_m, 1, constant_values=np.inf)
         images, cameras, exposed_ns = {}, {}, {}
         self._T_world_cam: dict[str, Float] = {}
-        folders = sorted(path.glob("camera/*"))
-        for folder in sorted(folders, key=lambda folder: folder.name != _FIRST_CAMERA):
+        folders = sorted(path.glob("camera/*"), key=lambda p: (p.name != _FIRST_CAMERA, p.name))
+        for folder in folders:
             name = folder.name
-            files = checks.numbered_files(folder, ".jpg", ".png")
-            if files:
+            if files := checks.numbered_files(folder, ".jpg", ".png"):
                 images_ns, self._T_world_cam[name] = _stamped_poses(folder, max(files))
                 images[name] = files
                 exposed_ns[name] = {number: int(images_ns[number]) for number in files}

@@ -75,12 +75,16 @@ class PoseTrack:
             stamp_ns: Time to which the points are compensated.
             offset_ns: (N,) firing times since ``stamp_ns``.
         """
-        fired = self._carry(points, stamp_ns, offset_ns, inverse=True)
+        if not len(points):
+            return points
+        turns, shift_m = self._motion_since(stamp_ns, offset_ns)
+        fired = turns.apply(points - shift_m, inverse=True)
         return np.where(points.any(axis=1, keepdims=True), fired, points)
 
     def compensate(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
         """Return (N,3) points moved from firing times to ``stamp_ns``, as data sets store them."""
-        return self._carry(points, stamp_ns, offset_ns, inverse=False)
+        turns, shift_m = self._motion_since(stamp_ns, offset_ns)
+        return turns.apply(points) + shift_m
 
     def undo_placement(self, placed: Returns, stamp_ns: int) -> Returns:
         """Return world points as fired, or without times in the vehicle frame at ``stamp_ns``."""
@@ -89,10 +93,8 @@ class PoseTrack:
             points = self.undo_compensation(points, stamp_ns, placed.offset_ns)
         return replace(placed, points=points)
 
-    def _carry(self, points: Float, stamp_ns: int, offset_ns: Int, inverse: bool) -> Float:
-        """Move points from their firing times to ``stamp_ns``, or back if ``inverse``."""
-        if not len(points):
-            return points
+    def _motion_since(self, stamp_ns: int, offset_ns: Int) -> tuple[Rotation, Float]:
+        """Return N rotations and shifts (N,3): poses at the firing times in that at the stamp."""
         # Poses relative to the pose at the stamp, at the ends of the sweep and at stored poses
         T_ref_world = poses.inverse(self.at(stamp_ns))
         begin_ns, end_ns = stamp_ns + int(offset_ns.min()), stamp_ns + int(offset_ns.max())
@@ -104,10 +106,7 @@ class PoseTrack:
         fired_ns, row = np.unique(offset_ns, return_inverse=True)  # many points share a firing time
         turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(fired_ns)[row]
         shifts_m = [np.interp(fired_ns, since_ns, axis) for axis in T_ref_ego[:, :3, 3].T]
-        shift_m = np.stack(shifts_m, axis=1)[row]
-        if inverse:
-            return turns.apply(points - shift_m, inverse=True)
-        return turns.apply(points) + shift_m
+        return turns, np.stack(shifts_m, axis=1)[row]
 
 
 def transform_from_world(placed: Float, T_world_ego: Float) -> Float:
@@ -145,7 +144,16 @@ class PoseFile:
         beside = {frame: path for frame, path in beside.items() if path.is_file()}
         if beside:
             return PoseFile._of_each(beside, "one file for each sweep", _one_pose)
-        return PoseFile._of_viewpoints(sweeps)
+        paths = list(sweeps.values())
+        if any(path.suffix.lower() != ".pcd" for path in paths):
+            return None
+        try:
+            # The default in the first and the last file is no pose.
+            if np.allclose([_viewpoint(path) for path in (paths[0], paths[-1])], np.eye(4)):
+                return None
+            return PoseFile._of_each(sweeps, "VIEWPOINT of each sweep", _viewpoint)
+        except InputError:  # some programs write zeros
+            return None
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
@@ -184,20 +192,6 @@ class PoseFile:
     def _of_each(paths: Mapping[int, Path], form: str, read: Callable[[Path], Float]) -> PoseFile:
         T = np.stack([read(path) for path in paths.values()])
         return PoseFile(next(iter(paths.values())), form, T, frames=tuple(paths))
-
-    @staticmethod
-    def _of_viewpoints(sweeps: Mapping[int, Path]) -> PoseFile | None:
-        """Read the poses in VIEWPOINT of .pcd files; None for other files and without poses."""
-        paths = list(sweeps.values())
-        if not all(path.suffix.lower() == ".pcd" for path in paths):
-            return None
-        try:
-            # The default in the first and the last file is no pose.
-            if np.allclose([_viewpoint(path) for path in (paths[0], paths[-1])], np.eye(4)):
-                return None
-            return PoseFile._of_each(sweeps, "VIEWPOINT of each sweep", _viewpoint)
-        except InputError:  # some programs write zeros
-            return None
 
     def by_frame(self, frames: Sequence[int]) -> dict[int, Float]:
         """Return frame number -> (4,4) pose; ``frames`` are the recording's, ascending.

@@ -3,6 +3,17 @@
 
 ``street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG&cameras=NAME,NAME]``, 16 seconds long. The
 cache (DENSIFY_CACHE_DIR, or the user's) may be deleted: rendering is reproducible byte for byte.
+
+Exact truth is the motion of bodies, and the body of each point. A body is a rigid part of the
+scene; body 0 is the static world. A ``truth/`` folder beside a written recording has::
+
+    bodies.npz             T_world_lidar (F,4,4): scanner poses at the reference times of F frames
+                           T_world_body (F,B,4,4): poses of B bodies at the reference times
+                           moving (F,B) bool: the body's object moves around the reference time
+    points/0000000120.npz  arrays for the N raw points of the sweep, row by row: body (N,) int32,
+                           instance (N,) int32 (-1 none), point (N,3) float64 in the body's frame
+    depth/image_02/0000000120.npz  depth_m (H,W) float32: camera z at the exposure, 0 if empty
+                           moving (H,W) bool: pixels of moving objects
 """
 
 from __future__ import annotations
@@ -11,9 +22,10 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -24,13 +36,14 @@ from densify.config.errors import InputError
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Camera, Float, Float32, Sweep, SweepTruth
 from densify.geometry.types.recordings import in_one_line
+from densify.readers.decoded_files import read_arrays
 from densify.street.cameras import CAMERAS, USUAL, Picture, cameras_beside
 from densify.street.lidar import SENSORS, Returns
 from densify.street.scenes import PRESETS
 from densify.street.simulator import VERSION, Bodies, Simulator
 
-T = TypeVar("T")
 _progress = logging.getLogger("densify.progress")
+_BODIES = ("T_world_lidar", "T_world_body", "moving")
 _SWEEPS_IN_MEMORY, _IMAGES_IN_MEMORY = 16, 8
 _OPTIONS = {"seed": "0", "sensor": "hdl64", "hz": "10", "tilt": "0", "cameras": ",".join(USUAL)}
 _NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole number from 0"
@@ -75,10 +88,12 @@ class Street:
         self._building = Lock()
         self._cache: Cache | None = Cache(folder=own_folder("street"))
         self._posed = f"{VERSION} {preset} {seed}{options}, with any sensor"
-        self._swept = f"{VERSION} {preset} {seed} {sensor}{options}"
-        self._pictured = f"{VERSION} {preset} {seed} {hz} Hz, with any sensor"
-        self._returns = lru_cache(_SWEEPS_IN_MEMORY)(self._render_returns)
-        self._picture = lru_cache(_IMAGES_IN_MEMORY)(self._render_picture)
+        swept = f"{VERSION} {preset} {seed} {sensor}{options}"
+        pictured = f"{VERSION} {preset} {seed} {hz} Hz, with any sensor"
+        render = partial(self._from_cache, "sweep", swept, self.simulator.returns)
+        self._returns = lru_cache(_SWEEPS_IN_MEMORY)(render)
+        render = partial(self._from_cache, "image", pictured, self.simulator.picture)
+        self._picture = lru_cache(_IMAGES_IN_MEMORY)(render)
 
     @staticmethod
     def from_spec(spec: str) -> Street:
@@ -156,25 +171,16 @@ class Street:
         """Poses of the scanner and of all simulated bodies at the reference time of each frame."""
         return get_cached(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
 
-    def _render_returns(self, frame: int) -> Returns:
-        return self._from_cache(
-            "sweep", (self._swept, frame), lambda: self.simulator.returns(frame)
-        )
+    def _from_cache(self, step: str, scene: str, render: Callable[..., Any], *which: Any) -> Any:
+        """Return a cached result, or render and keep it; ``scene`` and ``which`` identify it."""
 
-    def _render_picture(self, camera: str, number: int) -> Picture:
-        inputs = (self._pictured, camera, number)
-        return self._from_cache("image", inputs, lambda: self.simulator.picture(camera, number))
-
-    def _from_cache(self, step: str, inputs: Any, render: Callable[[], T]) -> T:
-        """Return a cached result, or render and keep it; ``inputs`` identifies it."""
-
-        def rendered() -> T:
+        def rendered() -> Any:
             _announce()
             with self._building:
                 _ = self.simulator.scene.world.triangles  # made once, for all threads
-            return render()
+            return render(*which)
 
-        return get_cached(self._cache, step, lambda: inputs, rendered)
+        return get_cached(self._cache, step, lambda: (scene, *which), rendered)
 
     def T_world_lidar(self, frame: int) -> Float:
         """Return the true pose T_world_lidar (4,4) at the sweep's reference time."""
@@ -218,6 +224,84 @@ class StreetTruth:
         frame = min(max(round(since_ns / simulator.period_ns), 0), frames[-1])
         moving: Bool = (body >= 0) & self._street.bodies.moving[frame][body]
         return moving
+
+
+def write_bodies(folder: Path, bodies: Bodies) -> None:
+    """Write the poses of the scanner and all bodies to ``bodies.npz`` in the ``truth`` folder."""
+    _save(folder / "bodies.npz", **{name: getattr(bodies, name) for name in _BODIES})
+
+
+def write_points(
+    folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
+) -> None:
+    """Write the ground truth of a sweep's N raw points, row by row.
+
+    Args:
+        body: (N,) index of the body of each point.
+        instance: (N,) number of its object, -1 for none.
+        point: (N,3) position in metres in the frame of the body.
+    """
+    path = folder / "points" / f"{frame:010d}.npz"
+    _save(path, body=body, instance=instance, point=point)
+
+
+def write_depth(folder: Path, camera: str, frame: int, depth_m: Float32, moving: Bool) -> None:
+    """Write the true depth (H,W) in metres and the mask (H,W) of moving objects of an image."""
+    _save(folder / "depth" / camera / f"{frame:010d}.npz", depth_m=depth_m, moving=moving)
+
+
+def _save(path: Path, **arrays: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **arrays)
+
+
+class FileTruth:
+    """Ground truth (`Truth`) read from a ``truth`` folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.bodies = Bodies(*self._load("bodies.npz", *_BODIES))
+
+    def sweep(self, frame: int) -> SweepTruth:
+        """Return the ground truth of a sweep's N raw points, in the lidar frame at its stamp."""
+        body, instance, point = self._points(frame)
+        return self.bodies.sweep(frame, body, instance, point)
+
+    def displacement(self, frame: int, target: int) -> Float:
+        """Return the (N,3) true scene flow (m) of a sweep's points to the time of ``target``."""
+        body, _, point = self._points(frame)
+        return self.bodies.displacement(frame, target, body, point)
+
+    def depth_m(self, camera: str, frame: int) -> Float32:
+        """Return the true depth (H,W) of an image in metres, 0 for pixels without a surface."""
+        depth_m: Float32 = self._load(f"depth/{camera}/{frame:010d}.npz", "depth_m")[0]
+        return depth_m
+
+    def moving_mask(self, camera: str, frame: int) -> Bool:
+        """Return an (H,W) mask of an image, True for pixels of moving objects."""
+        moving: Bool = self._load(f"depth/{camera}/{frame:010d}.npz", "moving")[0]
+        return moving
+
+    def _points(self, frame: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Float]:
+        """Return body (N,), instance (N,) and body-fixed position (N,3) of a sweep's points."""
+        self.bodies.check(frame)
+        name, num_bodies = f"points/{frame:010d}.npz", self.bodies.moving.shape[1]
+        body, instance, point = self._load(name, "body", "instance", "point")
+        if ((body < 0) | (body >= num_bodies)).any():
+            raise InputError(
+                f"{self._folder / name}: got bodies {body.min()} to {body.max()}, expected bodies "
+                f"below {num_bodies}"
+            )
+        return body, instance, point
+
+    def _load(self, name: str, *columns: str) -> list[NDArray[Any]]:
+        path = self._folder / name
+        if not path.exists():
+            raise InputError(f"{path}: no such truth file; write the frame again")
+        arrays = read_arrays(path, columns)
+        if missing := [column for column in columns if column not in arrays]:
+            raise InputError(f"{path}: holds no {', '.join(missing)}; write the truth again")
+        return [arrays[column] for column in columns]
 
 
 def _check(kind: str, got: str, known: Sequence[str] | Mapping[str, Any]) -> None:

@@ -72,10 +72,7 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns (N,) of a component by short name.
-
-        ``kinds`` (by short name) and ``where`` (by full name) are as in `read_arrow`.
-        """
+        """Return columns (N,) by short name; ``kinds`` and ``where`` are as in `read_arrow`."""
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -133,21 +130,6 @@ def _read_lasers(segment: Segment) -> dict[int, Laser]:
     return lasers
 
 
-def _read_boxes(segment: Segment) -> dict[int, Boxes]:
-    """Return boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
-    numbers = [f"box.{key}.{axis}" for key in ("center", "size") for axis in "xyz"]
-    kinds = {STAMP: "i", OBJECT: "s", **dict.fromkeys((*numbers, "box.heading"), "n")}
-    columns = segment.read("lidar_box", kinds)
-    centre_m, size_m = np.hsplit(np.stack([columns[n] for n in numbers], 1).astype(np.float64), 2)
-    T_vehicle_box = checks.upright_poses(centre_m, columns["box.heading"].astype(np.float64))
-    boxes = {}
-    for us in np.unique(columns[STAMP]).tolist():
-        rows = columns[STAMP] == us
-        where = f"{segment.file('lidar_box')}: frame_timestamp_micros {us}"
-        boxes[us] = checks.boxes(columns[OBJECT][rows], T_vehicle_box[rows], size_m[rows], where)
-    return boxes
-
-
 def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
     """Return times and poses of images by camera and frame; ``starts_us`` (n,) are the frames'."""
     keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
@@ -160,13 +142,12 @@ def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]
         if (frame := frame_of_start.get(int(us))) is not None:
             pose_s, shutter_s, trigger_s, done_s = map(float, times_s)
             name = dict(enumerate(CAMERAS, 1))[int(camera)]
+            where = f"{segment.file('camera_image')}: {name}, frame {frame}"
             images_of_camera[name][frame] = Image(
                 pose_ns=_whole_us(pose_s),
                 exposed_ns=_whole_us((trigger_s + done_s) / 2),
                 readout_s=max(done_s - trigger_s - shutter_s, 0.0),
-                T_world_vehicle=checks.pose(
-                    T, f"{segment.file('camera_image')}: {name}, frame {frame}"
-                ),
+                T_world_vehicle=checks.pose(T, where),
             )
     return {name: images for name, images in images_of_camera.items() if images}
 
@@ -175,12 +156,8 @@ def _read_cameras(
     segment: Segment, images: Mapping[str, Mapping[int, Image]]
 ) -> Iterator[tuple[str, Camera]]:
     """Yield the calibrated cameras that have images, with their names and rolling shutters."""
-    kinds = {
-        CAMERA: "i",
-        "extrinsic.transform": "l",
-        **dict.fromkeys(_LENS, "n"),
-        **dict.fromkeys(_SIZE, "i"),
-    }
+    kinds = {CAMERA: "i", "extrinsic.transform": "l"}
+    kinds |= {**dict.fromkeys(_LENS, "n"), **dict.fromkeys(_SIZE, "i")}
     columns = segment.read("camera_calibration", kinds)
     for name, camera_images in images.items():
         where = f"{segment.file('camera_calibration')}: {name}"
@@ -189,22 +166,18 @@ def _read_cameras(
         width, height, direction = (int(columns[key][row]) for key in _SIZE)
         readout_s = float(np.median([image.readout_s for image in camera_images.values()]))
         x, y = _READOUT.get(direction, (0.0, 0.0))
-        T_cam_vehicle = T_OPTICAL_WAYMO @ inverse(
-            checks.pose(columns["extrinsic.transform"][row], where)
-        )
-        yield (
+        T_vehicle_cam = checks.pose(columns["extrinsic.transform"][row], where)
+        camera = checks.pinhole(
             name,
-            checks.pinhole(
-                name,
-                (width, height),
-                (f_u, f_v, c_u - 0.5, c_v - 0.5),
-                T_cam_vehicle,
-                where,
-                distortion=tuple(distortion) if any(distortion) else (),
-                row_time_s=y * readout_s / max(height, 1),
-                column_time_s=x * readout_s / max(width, 1),
-            ),
+            (width, height),
+            (f_u, f_v, c_u - 0.5, c_v - 0.5),
+            T_OPTICAL_WAYMO @ inverse(T_vehicle_cam),
+            where,
+            distortion=tuple(distortion) if any(distortion) else (),
+            row_time_s=y * readout_s / max(height, 1),
+            column_time_s=x * readout_s / max(width, 1),
         )
+        yield name, camera
 
 
 def _whole_us(seconds: float) -> int:
@@ -215,9 +188,8 @@ def _whole_us(seconds: float) -> int:
 def open_recording(path: Path, scene: str | None) -> Waymo:
     """Return the segment ``scene`` (CONTEXT) of a split's folder; None for the only one."""
     names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
-    none = (
-        "no segments; expected files such as lidar/10017090168044687777_6380_000_6400_000.parquet"
-    )
+    example = "lidar/10017090168044687777_6380_000_6400_000.parquet"
+    none = f"no segments; expected files such as {example}"
     return Waymo(path, checks.chosen_scene("waymo", path, scene, names, none))
 
 
@@ -259,7 +231,22 @@ class Waymo(FileSequence):
 
     @cached_property
     def _boxes(self) -> dict[int, Boxes]:
-        return _read_boxes(self._segment) if self._segment.file("lidar_box").is_file() else {}
+        """Boxes by ``frame_timestamp_micros``, in the vehicle's frame at ``vehicle_pose``."""
+        path = self._segment.file("lidar_box")
+        if not path.is_file():
+            return {}
+        numbers = [f"box.{key}.{axis}" for key in ("center", "size") for axis in "xyz"]
+        kinds = {STAMP: "i", OBJECT: "s", **dict.fromkeys((*numbers, "box.heading"), "n")}
+        columns = self._segment.read("lidar_box", kinds)
+        values = np.stack([columns[name] for name in numbers], axis=1).astype(np.float64)
+        centre_m, size_m = np.hsplit(values, 2)
+        T_vehicle_box = checks.upright_poses(centre_m, columns["box.heading"].astype(np.float64))
+        boxes = {}
+        for us in np.unique(columns[STAMP]).tolist():
+            rows, where = columns[STAMP] == us, f"{path}: frame_timestamp_micros {us}"
+            names = columns[OBJECT][rows]
+            boxes[us] = checks.boxes(names, T_vehicle_box[rows], size_m[rows], where)
+        return boxes
 
     def T_world_cam(self, camera: str, number: int) -> Float:
         """Return the (4,4) pose T_world_cam at the middle of the exposure of image ``number``."""
@@ -271,14 +258,18 @@ class Waymo(FileSequence):
         return T_world_vehicle @ inverse(self.cameras[camera].T_cam_lidar)
 
     def _returns(self, frame: int) -> Returns:
+        begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
         points, intensity, offset_ns, lidar = [], [], [], []
         for number, image in self._range_images(frame):
-            laser = self._lasers[number]
+            laser, (height, width) = self._lasers[number], image.shape[:2]
             rays = laser.directions(image.shape[:2]) * image[..., :1]
             in_vehicle = transform(laser.T_vehicle_laser, rays.reshape(-1, 3))
             points.append(np.where(image[..., 0].reshape(-1, 1) > 0, in_vehicle, np.nan))
             intensity.append(np.tanh(image[..., 1].ravel()))
-            offset_ns.append(self._offset_ns(frame, number, image.shape).ravel())
+            column_ns = begin_ns + (np.arange(width) + 0.5) / width * self._period_ns
+            if number != 1:  # not TOP: taken to be at the stamp
+                column_ns = np.zeros(width)
+            offset_ns.append(np.tile(np.rint(column_ns).astype(np.int64), height))
             lidar.append(np.full(len(in_vehicle), number - 1, np.uint8))
         # Lidars without a calibration keep the identity.
         T = np.tile(np.eye(4), (len(LASERS), 1, 1))
@@ -305,18 +296,9 @@ class Waymo(FileSequence):
                     image = values.reshape(height, width, num_channels)
                     yield int(laser), image.astype(np.float64)
 
-    def _offset_ns(self, frame: int, laser: int, size: tuple[int, ...]) -> Int:
-        """Return firing times (H,W) in ns since the sweep's stamp, 0 for lidars other than TOP."""
-        height, width = size[:2]
-        if laser != 1:
-            return np.zeros((height, width), np.int64)
-        begin_ns = int(self._starts_us[frame]) * 1000 - self._stamps_ns[frame]
-        column_ns = begin_ns + (np.arange(width) + 0.5) / width * self._period_ns
-        return np.broadcast_to(np.rint(column_ns).astype(np.int64), (height, width))
-
     @cached_property
-    def _T_world_vehicle(self) -> dict[int, Float]:
-        """Poses T_world_vehicle (4,4) of the vehicle at the sweeps' stamps, by frame."""
+    def _T_world_vehicle(self) -> Float:
+        """(F,4,4) poses T_world_vehicle of the vehicle at the stamps of the F sweeps."""
         where = self._segment.file("vehicle_pose")
         kinds = {STAMP: "i", "world_from_vehicle.transform": "l"}
         columns = self._segment.read("vehicle_pose", kinds)
@@ -325,13 +307,14 @@ class Waymo(FileSequence):
             for us, values in zip(*columns.values(), strict=True)
         }
         T_of_frame = {f: T_of_start[us] for f, us in enumerate(self._starts_us) if us in T_of_start}
-        return {f: checks.find_entry(T_of_frame, f, "vehicle pose", where) for f in self.frames}
+        return np.stack(
+            [checks.find_entry(T_of_frame, f, "vehicle pose", where) for f in self.frames]
+        )
 
     @cached_property
     def _track(self) -> PoseTrack:
-        T = np.stack([self._T_world_vehicle[frame] for frame in self.frames])
         path = self._segment.file("vehicle_pose")
-        return PoseTrack(str(path), np.array(self._stamps_ns, np.int64), T)
+        return PoseTrack(str(path), np.array(self._stamps_ns, np.int64), self._T_world_vehicle)
 
     def _image(self, camera: Camera, number: int) -> NDArray[np.uint8]:
         where = {CAMERA: CAMERAS.index(camera.name) + 1, STAMP: int(self._starts_us[number])}

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, Int
 from densify.outputs import simulated_street
-from densify.readers.truth_files import write_bodies, write_depth, write_points
+from densify.readers.street import write_bodies, write_depth, write_points
 from densify.street.lidar import Returns
 
 put = simulated_street.put

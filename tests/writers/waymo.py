@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from densify.geometry.poses import inverse
-from densify.geometry.types import Camera, Float, Float32, Int
+from densify.geometry.types import Camera, Float, Int
 from densify.readers.waymo import CAMERA, CAMERAS, LASER, OBJECT, STAMP, T_OPTICAL_WAYMO, full_name
 from writers.excerpt import Excerpt, drawn_boxes
 
 T_EGO_LIDAR = np.eye(4)  # the place of Waymo's TOP
 T_EGO_LIDAR[:3, 3] = [1.43, 0.0, 2.18]
-POSED_COLUMNS = 60  # poses of the range images are right for each 60th column alone
 _SHUTTER_S = 0.005
 _DOWN, _GLOBAL = 1, 5  # directions of a shutter's readout
 
@@ -34,9 +32,7 @@ def write_waymo(excerpt: Excerpt, out: Path) -> Path:
     vehicle = [{**_key(excerpt, ns), name: _T_world_ego(excerpt, ns).ravel()} for ns in stamps_ns]
     _put(root, "lidar_calibration", [_laser(excerpt)])
     _put(root, "vehicle_pose", vehicle)
-    images = [_range_image(excerpt, frame, row_of[frame]) for frame in excerpt.frames]
-    for component, records in zip(("lidar", "lidar_pose"), zip(*images, strict=True), strict=True):
-        _put(root, component, records)
+    _put(root, "lidar", [_range_image(excerpt, *item) for item in row_of.items()])
     boxes = [box for frame in excerpt.frames for box in _boxes(excerpt, frame)]
     if boxes:
         _put(root, "lidar_box", boxes)
@@ -64,31 +60,22 @@ def pixels(excerpt: Excerpt, frame: int) -> Int:
     return (num_rows - 1 - excerpt.rings(frame)) * num_columns + column
 
 
-def _range_image(excerpt: Excerpt, frame: int, pixel: Int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The records of the ranges and of the poses."""
+def _range_image(excerpt: Excerpt, frame: int, pixel: Int) -> dict[str, Any]:
     street, returns = excerpt.street, excerpt.returns(frame)
     num_rows = len(_beams_deg(excerpt))
     num_columns, _ = excerpt.columns(frame, num_rows)
-    stamp_ns, period_ns = street.stamp_ns(frame), street.simulator.period_ns
     image = np.zeros((num_rows * num_columns, 4), np.float32)
     image[:, :2] = -1.0  # no return
     image[pixel, 0] = np.linalg.norm(excerpt.fired(frame), axis=1)
     image[pixel, 1] = np.arctanh(np.minimum(returns.intensity, 0.999))
-    share = (np.arange(0, num_columns, POSED_COLUMNS) + 0.5) / num_columns - 0.5
-    times_ns = stamp_ns + np.rint(share * period_ns).astype(np.int64)
-    T = excerpt.T_world_ego(times_ns, inverse(T_EGO_LIDAR))
-    yaw_pitch_roll = Rotation.from_matrix(T[:, :3, :3]).as_euler("ZYX")
-    columns = np.concatenate([yaw_pitch_roll[:, ::-1], T[:, :3, 3]], axis=1)
-    columns = np.repeat(columns, POSED_COLUMNS, axis=0)
-    pose = np.broadcast_to(columns, (num_rows, *columns.shape)).astype(np.float32)
-    key = {**_key(excerpt, stamp_ns), LASER: np.int8(1)}
-    ranges = {
-        **key,
-        **_matrix("range_image_return1", image, (num_rows, num_columns, 4)),
+    return {
+        **_key(excerpt, street.stamp_ns(frame)),
+        LASER: np.int8(1),
+        "range_image_return1.values": image.ravel(),
+        "range_image_return1.shape": np.array((num_rows, num_columns, 4), np.int32),
         "range_image_return2.values": None,
         "range_image_return2.shape": None,
     }
-    return ranges, {**key, **_matrix("range_image_return1", pose, pose.shape)}
 
 
 def _laser(excerpt: Excerpt) -> dict[str, Any]:
@@ -155,10 +142,6 @@ def _images(excerpt: Excerpt) -> list[dict[str, Any]]:
 
 def _key(excerpt: Excerpt, stamp_ns: int) -> dict[str, Any]:
     return {STAMP: np.int64((stamp_ns - excerpt.street.simulator.period_ns // 2) // 1000)}
-
-
-def _matrix(name: str, array: Float32, shape: Sequence[int]) -> dict[str, Any]:
-    return {f"{name}.values": array.ravel(), f"{name}.shape": np.array(shape, np.int32)}
 
 
 def _put(root: Path, component: str, records: Sequence[Mapping[str, Any]]) -> None:
