@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.depth.views import with_ages
 from densify.geometry.types import Camera, CameraView, Cloud, DepthMap, Result, StageCost
-from densify.outputs.export import export_run
+from densify.outputs.finished_run import export_run
 from densify.outputs.key_outputs import write_result
 from densify.pipeline.run import run, run_keys
 from tests.small_street import KEY, POSES_GIVEN, one_car

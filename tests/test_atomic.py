@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from densify.config.errors import OutputError
-from densify.outputs.atomic import clear_leftovers, file_aside, staged_folder, write_file
+from densify.outputs.folders import clear_leftovers, file_aside, staged_folder, write_file
 
 
 def everything_in(folder: Path) -> list[str]:
@@ -82,7 +82,7 @@ def test_what_killed_processes_left_goes_and_what_others_write_now_stays(tmp_pat
     code = """
 import os, sys
 from pathlib import Path
-from densify.outputs.atomic import staged_folder
+from densify.outputs.folders import staged_folder
 with staged_folder(Path(sys.argv[1]), ()) as staging:
     (staging / "half").write_text("half")
     os._exit(1)

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from densify.bench import flow as flow_bench
-from densify.bench.baselines import ip_basic
-from densify.bench.depth import bench_depth
+from densify.bench.depth import bench_depth, ip_basic
 from densify.bench.flow import bench_flow
 from densify.cli import main
 from densify.config import resolve

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from densify.bench.evaluation import evaluate
+from densify.bench.depth import evaluate
 from densify.outputs.depth_png import read_depth_png, write_depth_png
 from densify.readers.depth_trees import DepthPair, pair_depth_files
 from densify.scores.depth_metrics import depth_errors

@@ -17,7 +17,7 @@ import densify
 from densify.config.plugins import EXPORTS
 from densify.outputs.cloud_files import read_cloud
 from densify.outputs.depth_png import read_depth_png, stored_age, stored_confidence
-from densify.outputs.export import export_run
+from densify.outputs.finished_run import export_run
 from densify.readers.depth_trees import pair_depth_files
 from tests.command import exit_code
 from tests.command import refused as refused_command

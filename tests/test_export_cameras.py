@@ -18,7 +18,7 @@ from densify.geometry.cameras import image_points
 from densify.geometry.types import ObjectTrack, Result
 from densify.outputs.cloud_files import read_cloud
 from densify.outputs.depth_png import read_depth_png
-from densify.outputs.export import export_run
+from densify.outputs.finished_run import export_run
 from tests.exported import STAMPS_NS, H, W, refused, write_drive, write_views
 from tests.small_street import KEY, one_car
 

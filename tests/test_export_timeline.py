@@ -16,8 +16,7 @@ from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.outputs.cloud_files import read_cloud
 from densify.outputs.depth_png import read_depth_png
-from densify.outputs.export import export_run
-from densify.outputs.finished_run import finished_runs
+from densify.outputs.finished_run import export_run, finished_runs
 from densify.outputs.key_outputs import write_result
 from densify.outputs.viewers import timelines
 from densify.readers.kitti import KittiTracking, open_recording, read_labels

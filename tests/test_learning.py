@@ -17,7 +17,7 @@ from densify.config.errors import InputError
 from densify.flow.energy import on_one_thread
 from densify.flow.engines import Scene, estimate_motion
 from densify.free_space.ground import ground
-from densify.learning import engine
+from densify.learning import network
 from densify.learning.network import Model, NetworkCloud, build, order_for, read_model, write_model
 from densify.learning.training import (
     ALPHA,
@@ -254,10 +254,10 @@ def model(tmp_path_factory) -> Path:
 def moved(monkeypatch, scene: Scene, path: Path, flow_of: Callable) -> list[np.ndarray]:
     """flow_of: sweep number, (n,3) points above the ground -> flow that the network proposes."""
 
-    def flows(network, above, origins):
+    def flows(trained, above, origins):
         return [flow_of(i, sweep.points) for i, sweep in enumerate(above)]
 
-    monkeypatch.setattr(engine, "flows_of", flows)
+    monkeypatch.setattr(network, "flows_of", flows)
     motion = estimate_motion(scene, Config(), f"network:{path}")
     displacement = [motion.flow(frame, KEY_FRAME).displacement for frame in scene.stretch.frames]
     for frame, moves in zip(scene.stretch.frames, displacement, strict=True):

@@ -184,7 +184,7 @@ DOORS: dict[str, str | tuple[str, ...]] = {
     "kiss_icp": "densify/registration/odometry.py",
     "laspy": ("densify/readers/decoded_files.py", "densify/outputs/cloud_files.py"),
     "numba": ("densify/geometry/compiled.py",),
-    "pickle": ("densify/readers/column_files.py",),
+    "pickle": ("densify/readers/decoded_files.py",),
     "simplejpeg": "densify/readers/decoded_files.py",
     "small_gicp": "densify/registration/odometry.py",
     "torch": ("densify/flow/", "densify/dataset/loader.py", "densify/learning/"),

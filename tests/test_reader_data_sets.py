@@ -23,7 +23,7 @@ from densify.free_space.sensor import find_rings
 from densify.geometry.poses import inverse, transform
 from densify.readers import open_sequence
 from densify.readers.argoverse2 import Argoverse2
-from densify.readers.column_files import read_pickled
+from densify.readers.decoded_files import read_pickled
 from densify.readers.nuscenes import find_records
 from densify.readers.pandaset import T_POSE_LIDAR, PandaSet
 from densify.readers.street import Street

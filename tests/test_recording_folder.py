@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from densify.config.errors import InputError
 from densify.dataset.plan import Recipe, plan, write_plan
-from densify.outputs.export import export_run
-from densify.outputs.recording_folder import (
+from densify.outputs.finished_run import export_run
+from densify.outputs.folders import (
     check_recording,
     default_folder,
     drive_folder,

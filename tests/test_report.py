@@ -25,7 +25,7 @@ from densify.dataset.report import write_report
 from densify.geometry.types import Result
 from densify.outputs.cloud_files import read_cloud, write_cloud
 from densify.outputs.depth_png import encode_png, read_stored
-from densify.outputs.export import export_run
+from densify.outputs.finished_run import export_run
 from densify.outputs.key_outputs import write_comparison, write_result
 from densify.outputs.report_page import Blobs, pack_cloud, page_file, thin_cloud
 from densify.pipeline.run import compare

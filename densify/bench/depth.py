@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Compare the depth maps of several settings with every ground truth: ``densify bench depth``.
+"""Compare depth maps with ground truth: ``densify bench depth``, ``bench baselines``, ``evaluate``.
 
 Ground truths by name. ``truth``: exact depth of a simulated recording below the scanner's top ring
 and within 80 m. ``key held out``: returns of the key sweep, for a map made from the other sweeps.
@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from itertools import product as cartesian
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
-from densify.config import Config
+from densify.bench.gate import KEYS, GateKey, Subject
+from densify.config import Config, resolve
 from densify.config.errors import InputError
 from densify.depth.exposure import Exposure, Shot, key_shots
 from densify.geometry import poses
@@ -37,8 +40,17 @@ from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.process import Watch
 from densify.pipeline.recording import Recording
+from densify.pipeline.run import densify
+from densify.readers.depth_trees import DepthPair, DepthPairs
 from densify.readers.timeline import choose_cameras
-from densify.scores.depth_metrics import KITTI_BASELINE_M, image_density, is_outlier_depth
+from densify.scores.depth_metrics import (
+    KITTI_BASELINE_M,
+    DepthErrors,
+    errors_by_part,
+    image_density,
+    is_outlier_depth,
+    mean_errors,
+)
 
 PRODUCTS = ("measured", "filled")
 _GROUPS = ("all", "moving")  # of pixels
@@ -298,3 +310,168 @@ class _Sums:
             }
         density = {product: float(np.mean(shares)) for product, shares in self._densities.items()}
         return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}
+
+
+_FARTHEST_M = 100.0  # of inverted depths
+_DIAMOND = np.array(
+    [[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8
+)
+_SINGLE_SWEEP = {"accumulate": {"far_m": 0}}
+
+
+GROUPS: Mapping[str, tuple[GateKey, ...]] = {
+    "KITTI, stereo": tuple(key for key in KEYS if key.truth == "stereo"),
+    "PandaSet, second scanner": tuple(key for key in KEYS if key.truth == "scanner"),
+    "street, exact": tuple(key for key in KEYS if key.data == "street?seed=301"),
+}
+"""Name of a truth -> keys that it scores."""
+
+
+def errors_of_methods(
+    keys: Sequence[GateKey], folder: Path | None
+) -> dict[str, dict[str, DepthErrors]]:
+    """Return method -> part of the pixels (as `errors_by_part`) -> mean errors over the keys."""
+    errors: dict[str, dict[str, list[DepthErrors]]] = {}
+    for key in keys:
+        subject = Subject.of(key, folder, None)
+        truth = cast(TruthMap, subject.truth)  # none of these keys is held out
+        focal_px = subject.camera.focal_px
+        for method, depth_m in _maps(subject).items():
+            parts = errors_by_part(
+                depth_m,
+                truth.depth_m,
+                truth.moving,
+                focal_px=focal_px,
+                baseline_m=truth.baseline_m,
+            )
+            for part, of_key in parts.items():
+                errors.setdefault(method, {}).setdefault(part, []).append(of_key)
+    return {
+        method: {part: mean_errors(of_keys) for part, of_keys in parts.items()}
+        for method, parts in errors.items()
+    }
+
+
+def _maps(subject: Subject) -> dict[str, Float32]:
+    """Return name of the method -> its map (H,W) in metres."""
+    key, camera = subject.key.key, subject.key.camera
+    results = densify(subject.recording, key, ["none", "icp", "flow"], [camera], Watch())
+    sweep_m, ours = results["none"].depth[camera].depth_m, results["flow"].depth[camera]
+    alone = Recording(subject.recording.sequence, resolve(_SINGLE_SWEEP), 0, [key])
+    single = densify(alone, key, ["flow"], [camera], Watch())["flow"].depth[camera]
+    return {
+        "single sweep": sweep_m,
+        "single sweep, filled": single.filled_m,
+        "single sweep, IP-Basic": ip_basic(sweep_m),
+        "rigid (ICP)": results["icp"].depth[camera].depth_m,
+        "densify, measured": ours.depth_m,
+        "densify, filled": ours.filled_m,
+    }
+
+
+def ip_basic(sparse_m: Float32) -> Float32:
+    """Return a map filled by dilation and closing, (H,W) metres, 0 where nothing is near.
+
+    ``sparse_m`` is (H,W) metres, 0 for none. Source: Ku, Harakeh, Waslander, "In Defense of
+    Classical Image Processing: Fast Depth Completion on the CPU", CRV 2018, not extended upwards.
+    """
+    has_depth = (sparse_m > 0) & (sparse_m < _FARTHEST_M)
+    inverted = np.where(has_depth, np.float32(_FARTHEST_M) - sparse_m, np.float32(0))
+    inverted = np.asarray(cv2.dilate(inverted, _DIAMOND), np.float32)
+    inverted = cv2.morphologyEx(inverted, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    for size in (7, 31):
+        dilated = cv2.dilate(inverted, np.ones((size, size), np.uint8))
+        inverted = np.where(inverted > 0, inverted, dilated).astype(np.float32)
+    blurred = cv2.GaussianBlur(cv2.medianBlur(inverted, 5), (5, 5), 0)
+    return np.where(inverted > 0, np.float32(_FARTHEST_M) - blurred, 0).astype(np.float32)
+
+
+SCHEMA_VERSION = 1
+"""Version of `evaluate`'s dictionary. It grows when an entry changes its meaning or is removed."""
+_AGREEMENT = 0.05  # of a map and its truth in most pixels
+_MILLIMETRES = 1000 / 256  # factor between the two usual scales of stored depth
+KITTI_FOCAL_PX = 721.5377
+"""Focal length of KITTI's rectified cameras on 2011_09_26. On other days it is 707 to 719 px."""
+
+
+def evaluate(
+    pairs: DepthPairs,
+    focal_px: float = KITTI_FOCAL_PX,
+    baseline_m: float = KITTI_BASELINE_M,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Return the scores of depth maps, averaged over images as in KITTI's development kit.
+
+    The result has plain numbers ready for JSON, None if undefined::
+
+        schema_version, focal_px, baseline_m, num_images
+        density      predicted, truth: mean share of all the pixels that have a depth
+        parts        name of `errors_by_part` -> num_images and the values of `mean_errors`
+        images       for each pair: predicted, truth, mask (paths or None), density, `DepthErrors`
+        without_truth, without_prediction, without_mask   paths of files without a partner
+
+    Disparity, which defines outliers and depth discontinuities, is focal length times baseline over
+    depth. ``progress`` is called with (stage, done, total).
+    """
+    stereo = {"focal_px": focal_px, "baseline_m": baseline_m}
+    by_part: dict[str, list[DepthErrors]] = defaultdict(list)
+    images: list[dict[str, Any]] = []
+    for number, pair in enumerate(pairs.pairs):
+        predicted_m, truth_m, moving = _read(pair)
+        _check_unit(pair, predicted_m, truth_m)
+        errors = errors_by_part(predicted_m, truth_m, moving, **stereo)
+        for name, of_part in errors.items():
+            by_part[name].append(of_part)
+        paths = {side: None if path is None else str(path) for side, path in vars(pair).items()}
+        densities = {"predicted": image_density(predicted_m), "truth": image_density(truth_m)}
+        images.append({**paths, "density": densities, **asdict(errors["all"])})
+        if progress is not None:
+            progress("evaluate", number + 1, len(pairs.pairs))
+    return {
+        "schema_version": SCHEMA_VERSION,
+        **stereo,
+        "num_images": len(images),
+        "density": {
+            side: float(np.mean([image["density"][side] for image in images]))
+            for side in ("predicted", "truth")
+        },
+        "parts": {
+            name: {"num_images": sum(e.num_compared > 0 for e in errors)}
+            | asdict(mean_errors(errors))
+            for name, errors in by_part.items()
+        },
+        "images": images,
+        "without_truth": [*map(str, pairs.without_truth)],
+        "without_prediction": [*map(str, pairs.without_prediction)],
+        "without_mask": [*map(str, pairs.without_mask)],
+    }
+
+
+def _check_unit(pair: DepthPair, predicted_m: Float32, truth_m: Float32) -> None:
+    """Raise InputError if one of two maps stores 1000 x metres instead of 256 x metres."""
+    compared = (predicted_m > 0) & (truth_m > 0)
+    if not compared.any():
+        return
+    ratio = predicted_m[compared] / truth_m[compared]
+    for path, too_large in ((pair.predicted, ratio), (pair.truth, 1 / ratio)):
+        quartiles = np.percentile(too_large, [25, 50, 75])
+        if np.abs(quartiles / _MILLIMETRES - 1).max() < _AGREEMENT:
+            raise InputError(
+                f"{path}: holds depths {quartiles[1]:.2f} times those of the other map, as if it "
+                f"stored 1000 x metres (millimetres); expected 256 x metres: multiply its values "
+                f"by 0.256"
+            )
+
+
+def _read(pair: DepthPair) -> tuple[Float32, Float32, Bool | None]:
+    """Return (H,W) predicted metres, (H,W) true metres, and an (H,W) mask of moving pixels."""
+    predicted_m, truth_m = read_depth_png(pair.predicted), read_depth_png(pair.truth)
+    moving = None if pair.mask is None else read_mask_png(pair.mask)
+    for path, image in ((pair.predicted, predicted_m), (pair.mask, moving)):
+        if image is not None and image.shape != truth_m.shape:
+            raise InputError(
+                f"{path}: got {image.shape[1]} x {image.shape[0]} px, expected "
+                f"{truth_m.shape[1]} x {truth_m.shape[0]}, the size of {pair.truth}; give maps of "
+                f"the same camera, neither cropped nor scaled"
+            )
+    return predicted_m, truth_m, moving

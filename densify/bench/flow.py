@@ -32,7 +32,7 @@ from densify.geometry.types import (
     Stretch,
     Truth,
 )
-from densify.outputs.atomic import plain
+from densify.outputs.folders import plain
 from densify.pipeline.accumulate import accumulate
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence

@@ -19,8 +19,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from densify.bench.baselines import ip_basic
-from densify.bench.depth import Altered, TruthMap, without_scanner
+from densify.bench.depth import Altered, TruthMap, ip_basic, without_scanner
 from densify.bench.gate import KEYS, GateKey, Subject
 from densify.config import resolve
 from densify.config.cache import Cache
@@ -28,7 +27,7 @@ from densify.config.errors import InputError
 from densify.depth.exposure import key_shots, load_images
 from densify.geometry.types import LidarSequence, Progress
 from densify.learning.completion import SIZES, Completion, Sample, predict, train
-from densify.outputs.atomic import file_aside, write_json
+from densify.outputs.folders import file_aside, write_json
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import densify
 from densify.readers import open_sequence

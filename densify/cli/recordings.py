@@ -33,9 +33,8 @@ from densify.doctor import Diagnosis, Verdict, examine
 from densify.flow.two_clouds import estimate_flow
 from densify.geometry.types import Float
 from densify.learning.labels import Label, label_sweeps, write_label
-from densify.outputs.atomic import write_file
 from densify.outputs.flow_writers import flow_npz, flow_writer
-from densify.outputs.recording_folder import check_recording, default_folder
+from densify.outputs.folders import check_recording, default_folder, write_file
 from densify.outputs.simulated_street import write_street
 from densify.pipeline.run import flow_steps
 from densify.readers import align, describe, findings, open_sequence

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from densify.bench.evaluation import evaluate
+from densify.bench.depth import evaluate
 from densify.cli.options import config_of, raise_failures, recording_of, selected_frames
 from densify.cli.screen import (
     Answer,
@@ -28,12 +28,10 @@ from densify.config import as_mapping
 from densify.config.errors import ComputationError, InputError
 from densify.dataset.report import write_comparison_page, write_report
 from densify.geometry.types import METHOD_NAMES, LidarSequence, Result
-from densify.outputs.atomic import plain
-from densify.outputs.export import export_run, facts
-from densify.outputs.finished_run import Thresholds, finished_runs
+from densify.outputs.finished_run import Thresholds, export_run, facts, finished_runs
+from densify.outputs.folders import check_recording, default_folder, plain
 from densify.outputs.key_outputs import check_writable, write_comparison, write_result
 from densify.outputs.plots import order_front_first
-from densify.outputs.recording_folder import check_recording, default_folder
 from densify.outputs.viewers import show_in_open3d, show_in_rerun
 from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import USUAL

@@ -144,7 +144,7 @@ class Screen(logging.Handler):
         if error is not None:
             logging.getLogger("densify").error("%s", error)
         if self._is_json:
-            from densify.outputs.atomic import plain
+            from densify.outputs.folders import plain
 
             outcome = {"exit_code": exit_code, "error": error, "warnings": self._warnings}
             facts = plain({**self._facts, **outcome})

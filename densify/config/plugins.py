@@ -122,7 +122,7 @@ ENGINES = Table(
         Plugin("groups", "densify.flow.tracking.groups", shared=True),
         Plugin("pairs", "densify.flow.two_clouds"),
         Plugin("paper", "densify.flow.objective"),
-        Plugin("network", "densify.learning.engine", argument="MODEL"),
+        Plugin("network", "densify.learning.network", argument="MODEL"),
         Plugin("npz", "densify.readers.flow_files", argument="DIR"),
     ),
 )

@@ -47,8 +47,8 @@ from densify.dataset.report import FILLED, find_map, front_camera, keep_picture
 from densify.flow.engines import check_engine
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Result
-from densify.outputs.atomic import LEFT_AFTER_S, clear_leftovers
 from densify.outputs.depth_png import read_depth_png
+from densify.outputs.folders import LEFT_AFTER_S, clear_leftovers
 from densify.outputs.key_outputs import write_result
 from densify.outputs.kitti_tree import write_key, write_readme
 from densify.pipeline import run as pipeline

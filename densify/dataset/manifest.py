@@ -32,7 +32,7 @@ import numpy as np
 
 from densify.config.errors import InputError, OutputError
 from densify.config.file_content import import_extra, parse_json, read_bytes
-from densify.outputs.atomic import plain, write_file
+from densify.outputs.folders import plain, write_file
 
 Status = Literal["done", "aside", "failed"]
 Key = tuple[str, int]

@@ -25,8 +25,7 @@ from densify.config import Config, Section, as_mapping, choice_field, number_fie
 from densify.config.errors import InputError
 from densify.config.file_content import read_json
 from densify.geometry.types import Camera, LidarSequence
-from densify.outputs.atomic import plain, write_file
-from densify.outputs.recording_folder import drive_folder, is_same, split_of
+from densify.outputs.folders import drive_folder, is_same, plain, split_of, write_file
 from densify.pipeline.sweeps import Cut
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import Timeline, check_window, choose_cameras, format_frames, to_runs

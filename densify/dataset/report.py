@@ -33,8 +33,8 @@ from densify.dataset.manifest import (
 from densify.dataset.plan import Drive, drives_of, planned_keys, read_plan
 from densify.depth.exposure import key_shots
 from densify.geometry.types import METHOD_NAMES, Float32, LidarSequence
-from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_jpeg, metres, read_stored
+from densify.outputs.folders import write_file
 from densify.outputs.plots import Dot, depth_over_image, order_front_first, score_plot
 from densify.outputs.report_page import KeyFiles, fill_template, key_page
 from densify.readers import open_sequence

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from densify.depth.measured_pixels import ALL_ROUND, MapRecord
+from densify.depth.project import ALL_ROUND, MapRecord
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Int
 from densify.scores.depth_metrics import (
     DECADES,

@@ -16,10 +16,9 @@ from densify.depth.confidence import nearest_pixel, reliability, tolerance, with
 from densify.depth.exposure import Exposure, InView, Shot, pixel_of
 from densify.depth.far import far_cloud
 from densify.depth.fill import to_lab
-from densify.depth.measured_pixels import MapInputs
 from densify.depth.moving_bodies import find_far_inside, fronts
 from densify.depth.patches import find_patches, hidden_m
-from densify.depth.project import project
+from densify.depth.project import MapInputs, project
 from densify.depth.rays import MovingBody, Rays, find_moving_bodies, without_sweep
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses

@@ -29,8 +29,8 @@ from densify.geometry.types import (
     Progress,
     RegisteredSweep,
 )
-from densify.outputs.atomic import write_file
 from densify.outputs.flow_writers import flow_npz
+from densify.outputs.folders import write_file
 from densify.pipeline.recording import Recording
 
 # Least speed of a moving box; box poses are not accurate (Chodosh et al., WACV 2024)

@@ -23,12 +23,10 @@ from densify.config.file_content import read_bytes
 from densify.geometry import poses
 from densify.geometry.arrays import joined_rows
 from densify.geometry.types import Camera, Float, Float32
-from densify.outputs.atomic import write_file, write_json
 from densify.outputs.cloud_files import StoredCloud, save_ply
 from densify.outputs.depth_png import encode_png, metres
-from densify.outputs.export import save_exr
-from densify.outputs.finished_run import FinishedRun, key_poses
-from densify.outputs.recording_folder import drive_folder
+from densify.outputs.finished_run import FinishedRun, key_poses, save_exr
+from densify.outputs.folders import drive_folder, write_file, write_json
 from densify.readers.decoded_files import decode_image
 
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.geometry.arrays import select_rows, table
 from densify.geometry.types import Bool, Cloud, Float, Float32, Int
-from densify.outputs.atomic import write_file
+from densify.outputs.folders import write_file
 from densify.readers.decoded_files import read_las
 
 _SCALE_M = 0.001

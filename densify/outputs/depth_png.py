@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from densify.config.errors import InputError
 from densify.geometry.types import Bool, Float32
-from densify.outputs.atomic import write_file
+from densify.outputs.folders import write_file
 from densify.readers.decoded_files import read_image
 
 Picture = NDArray[np.uint8]

@@ -23,8 +23,8 @@ from densify.config.file_content import import_extra
 from densify.free_space.ground import ABOVE_GROUND_M, ground
 from densify.geometry import poses
 from densify.geometry.types import Float, FlowField, Int, LidarSequence, Stretch, StretchFlow
-from densify.outputs.atomic import file_aside, write_file, write_json
 from densify.outputs.cloud_files import save_ply
+from densify.outputs.folders import file_aside, write_file, write_json
 from densify.readers.recorded_poses import PoseTrack
 
 _MOVING, _STATIC = 251, 9  # SemanticKITTI's labels

@@ -18,7 +18,6 @@ import yaml
 from densify.config.errors import InputError
 from densify.geometry.types import Result
 from densify.outputs import flow_writers, plots
-from densify.outputs.atomic import plain, staged_folder, write_file, write_json
 from densify.outputs.cloud_files import write_cloud
 from densify.outputs.depth_png import (
     encode_jpeg,
@@ -29,7 +28,7 @@ from densify.outputs.depth_png import (
     write_depth_png,
     write_flow_png,
 )
-from densify.outputs.recording_folder import check_recording
+from densify.outputs.folders import check_recording, plain, staged_folder, write_file, write_json
 from densify.outputs.report_page import KeyFiles, key_page
 from densify.version import __version__
 

@@ -21,11 +21,10 @@ from densify.config.errors import InputError
 from densify.depth.rays import corners_of, grow_box
 from densify.geometry import cameras, poses
 from densify.geometry.types import CameraView, DepthMap, Float, ObjectTrack
-from densify.outputs.atomic import plain, write_file, write_json
 from densify.outputs.cloud_files import StoredCloud
 from densify.outputs.depth_png import encode_png, map_path, write_confidence_png, write_depth_png
 from densify.outputs.finished_run import FinishedRun
-from densify.outputs.recording_folder import drive_folder, split_of
+from densify.outputs.folders import drive_folder, plain, split_of, write_file, write_json
 from densify.readers.decoded_files import decode_image
 from densify.version import __version__
 

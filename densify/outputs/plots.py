@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from densify.geometry.types import METHOD_NAMES, CameraView, Float, Float32, Result
-from densify.outputs.atomic import write_file
 from densify.outputs.depth_png import Picture, encode_png
+from densify.outputs.folders import write_file
 from densify.scores.depth_metrics import precision_density
 
 if TYPE_CHECKING:

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from densify.config.errors import InputError
 from densify.config.file_content import read_bytes, read_json, read_yaml
 from densify.geometry.types import Bool, Float, Int, ObjectTrack
-from densify.outputs.atomic import plain
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import PixelType, read_stored
 from densify.outputs.finished_run import map_names, read_scene, read_tracks
+from densify.outputs.folders import plain
 from densify.outputs.plots import order_front_first
 from densify.readers.decoded_files import decode_image
 from densify.version import __version__

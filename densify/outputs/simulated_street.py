@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.geometry import poses
 from densify.geometry.types import Float, Float32, Int, Progress
-from densify.outputs.atomic import staged_folder
 from densify.outputs.depth_png import encode_png
+from densify.outputs.folders import staged_folder
 from densify.readers import checks
 from densify.readers.folder_config import NAME
 from densify.readers.kitti import KITTI_TRIGGER_LATENCY_NS

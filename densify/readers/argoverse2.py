@@ -26,7 +26,7 @@ from densify.config.errors import InputError
 from densify.geometry.poses import inverse
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers import checks
-from densify.readers.column_files import read_arrow
+from densify.readers.decoded_files import read_arrow
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
 

@@ -36,8 +36,7 @@ from densify.flow.chained import ChainedMotion
 from densify.flow.engines import Scene
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, Motion, Stretch
-from densify.readers.column_files import read_arrow
-from densify.readers.decoded_files import read_arrays
+from densify.readers.decoded_files import read_arrays, read_arrow
 from densify.scores.metrics import CLASSES, IGNORED
 
 MOVES_M = 0.05

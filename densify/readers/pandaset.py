@@ -28,8 +28,7 @@ from densify.config.file_content import described_in, read_json
 from densify.geometry import poses
 from densify.geometry.types import Boxes, Camera, Float, Int
 from densify.readers import checks
-from densify.readers.column_files import read_pickled
-from densify.readers.decoded_files import image_size_px
+from densify.readers.decoded_files import image_size_px, read_pickled
 from densify.readers.file_sequence import FileSequence, Returns
 from densify.readers.recorded_poses import PoseTrack
 
