@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from densify.pipeline.run import run as run
     from densify.pipeline.run import run_keys as run_keys
     from densify.readers import open_sequence as open_sequence
-    from densify.scores.depth_metrics import outlier_probability as outlier_probability
+    from densify.scores.metrics import outlier_probability as outlier_probability
 
 _NAMES = {
     "densify.config": "Config",
@@ -58,7 +58,7 @@ _NAMES = {
     "densify.outputs.finished_run": "load_result",
     "densify.pipeline.run": "compare run run_keys",
     "densify.readers": "open_sequence",
-    "densify.scores.depth_metrics": "outlier_probability",
+    "densify.scores.metrics": "outlier_probability",
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 

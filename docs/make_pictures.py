@@ -33,7 +33,7 @@ from densify.cli import main as densify
 from densify.outputs import report_page
 from densify.outputs.cloud_files import read_cloud
 from densify.outputs.depth_png import read_stored
-from densify.scores.depth_metrics import is_outlier_depth
+from densify.scores.metrics import is_outlier_depth
 
 DOCS = Path(__file__).resolve().parent
 PICTURES, REPORTS = DOCS / "pictures", DOCS / "reports"

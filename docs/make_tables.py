@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from densify.bench import gate
-from densify.bench.gate import coverage, outliers_at
 from densify.bench.training import mean_and_error
-from densify.scores.depth_metrics import LEAST_PIXELS
+from densify.bench.verdicts import coverage, outliers_at
+from densify.scores.metrics import LEAST_PIXELS
 
 ROOT = Path(__file__).resolve().parent.parent
 NUMBERS = ROOT / "docs/numbers.json"

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 import densify
-from densify.scores.depth_metrics import depth_scores
+from densify.scores.metrics import depth_scores
 
 BASELINE_M = 0.532725  # of image_02 and image_03 of the drives of 2011_09_26
 

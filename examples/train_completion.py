@@ -13,7 +13,7 @@ import numpy as np
 
 import densify
 from densify.learning.completion import Completion, Sample, predict, train
-from densify.scores.depth_metrics import depth_errors
+from densify.scores.metrics import depth_errors
 
 
 def samples(folder: str) -> Iterator[tuple[Sample, np.ndarray, float]]:

@@ -8,8 +8,9 @@ import numpy as np
 from densify.config import ProjectSettings
 from densify.depth.exposure import Exposure, PointsInImage
 from densify.depth.fill import to_lab
+from densify.depth.measured_pixels import ALL_ROUND, MapInputs, MapRecord
 from densify.depth.patches import find_patches
-from densify.depth.project import ALL_ROUND, MapInputs, MapRecord, project
+from densify.depth.project import project
 from densify.free_space.sensor import Sensors
 from densify.geometry.types import Camera, Cloud, RegisteredSweep, Sweep
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from densify.flow.chained import ChainedMotion
+from densify.flow.engines import ChainedMotion
 from densify.geometry import poses
 from densify.geometry.types import FlowField, RegisteredSweep, Stretch, Sweep
 

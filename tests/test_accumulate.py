@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from densify.flow.chained import ChainedMotion
+from densify.flow.engines import ChainedMotion
 from densify.geometry import poses
 from densify.geometry.types import FlowField
 from densify.pipeline.accumulate import accumulate

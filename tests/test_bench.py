@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from densify.bench import flow as flow_bench
-from densify.bench.depth import bench_depth, ip_basic
+from densify.bench.depth import bench_depth
 from densify.bench.flow import bench_flow
+from densify.bench.gate import ip_basic
 from densify.cli import main
 from densify.config import resolve
 from densify.config.errors import InputError

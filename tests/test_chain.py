@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from densify.flow.chained import ChainedMotion
+from densify.flow.engines import ChainedMotion
 from densify.geometry.types import FlowField
 from tests.exact_motion import (
     FRAMES,

@@ -15,7 +15,7 @@ from densify.bench.training import Plan, bench_training, mean_and_error
 from densify.cli import main
 from densify.config.errors import InputError
 from densify.learning.completion import Completion, Sample, predict, train
-from densify.scores.depth_metrics import depth_errors
+from densify.scores.metrics import depth_errors
 
 FOCAL_PX = 100.0
 H, W = 48, 96

@@ -10,9 +10,9 @@ import pytest
 
 import densify
 from densify.depth import confidence as scale
-from densify.depth.project import MapRecord
+from densify.depth.measured_pixels import MapRecord
 from densify.geometry.types import DepthMap, Rejected
-from densify.scores.depth_metrics import is_outlier_depth
+from densify.scores.metrics import is_outlier_depth
 from tests.depth_scenes import record_of
 from tests.scenes import CAMERA
 

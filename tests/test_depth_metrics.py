@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from densify.geometry.types import DepthMap
-from densify.scores.depth_metrics import (
+from densify.scores.metrics import (
     DepthErrors,
     depth_edges,
     depth_errors,

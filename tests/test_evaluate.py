@@ -15,7 +15,7 @@ import pytest
 from densify.bench.depth import evaluate
 from densify.outputs.depth_png import read_depth_png, write_depth_png
 from densify.readers.depth_trees import DepthPair, pair_depth_files
-from densify.scores.depth_metrics import depth_errors
+from densify.scores.metrics import depth_errors
 from tests.command import exit_code, refused
 from tests.exported import refusal
 

@@ -16,7 +16,7 @@ from densify.readers.timeline import Timeline
 from densify.registration import road_poses
 from densify.registration.odometry import Surface
 from densify.registration.road_poses import follow_road
-from densify.scores.depth_metrics import depth_scores
+from densify.scores.metrics import depth_scores
 from tests.scenes import CAMERA, Arc, Scanner, Scene, TinySequence, World, by_flow, car, street
 
 KEY, WINDOW, NUM_FRAMES = 15, 2, 36

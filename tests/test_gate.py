@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from densify.bench import gate
-from densify.bench.gate import beyond_luck, coverage, curve, outliers_at, verdicts
+from densify.bench.verdicts import beyond_luck, coverage, curve, outliers_at, verdicts
 from densify.config import resolve
 from densify.pipeline.recording import Recording
 from densify.pipeline.run import densify as densify_key

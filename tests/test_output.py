@@ -231,7 +231,7 @@ def test_places_that_cannot_be_written_to(put, tmp_path, monkeypatch):
     put()
     denied: list[Path] = []
     monkeypatch.setattr(
-        "densify.outputs.key_outputs.os.access", lambda path, _: Path(path) not in denied
+        "densify.outputs.folders.os.access", lambda path, _: Path(path) not in denied
     )
     for place in (tmp_path / "out", tmp_path / "out" / "000120"):
         denied[:] = [place]

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Measure the main figures of many keys, and judge changes: ``densify bench gate``."""
+"""Measure the main figures of many keys: ``densify bench gate``, ``densify bench baselines``."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import cv2
 import numpy as np
 
 from densify.bench.depth import (
@@ -22,6 +22,7 @@ from densify.bench.depth import (
     stereo_truth,
     without_scanner,
 )
+from densify.bench.verdicts import Curve, change, curve
 from densify.config import resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
@@ -46,154 +47,17 @@ from densify.outputs.folders import write_file
 from densify.pipeline.key_result import METHODS, see
 from densify.pipeline.process import Watch
 from densify.pipeline.recording import Recording
-from densify.pipeline.run import scene_of
+from densify.pipeline.run import densify, scene_of
 from densify.readers import open_sequence
 from densify.readers.timeline import choose_cameras
 from densify.registration.trajectory import Registration
-from densify.scores.metrics import end_point_errors, window_pose_errors
-
-_NUM_STEPS = 200  # number of steps of a curve
-_BEYOND = 2.0  # standard deviations of luck, and standard errors between keys
-
-Curve = Mapping[str, Any]
-"""Outliers of a map over its coverage.
-
-``num``: number of pixels with a true depth. ``covered``: number of those with a depth.
-``outliers``: number of outliers among the most certain 0, 0.5, … 100 % of the covered pixels.
-"""
-
-
-def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
-    """Return the curve of outliers over coverage of a map with ``num_true`` true depths.
-
-    ``confidence`` and ``outliers`` are (K,), of those pixels that also have a depth. Pixels of
-    equal confidence share their outliers evenly.
-    """
-    _, rank, size = np.unique(-confidence, return_inverse=True, return_counts=True)
-    outliers_of_rank = np.bincount(rank, outliers, len(size))
-    ends = np.append(0, size.cumsum())
-    sums = np.append(0, outliers_of_rank.cumsum())
-    steps = np.interp(np.linspace(0, len(confidence), _NUM_STEPS + 1), ends, sums)
-    return {"num": num_true, "covered": len(confidence), "outliers": np.round(steps, 2).tolist()}
-
-
-def coverage(outliers: Curve) -> float:
-    """Return the coverage in percent: the share of pixels with a true depth that have a depth."""
-    return 100 * outliers["covered"] / max(outliers["num"], 1)
-
-
-def outliers_at(outliers: Curve, covered_percent: float) -> float:
-    """Return the share of outliers, percent, among the most certain pixels of this coverage."""
-    num = covered_percent / 100 * outliers["num"]
-    steps = np.linspace(0, outliers["covered"], len(outliers["outliers"]))
-    return float(100 * np.interp(num, steps, outliers["outliers"]) / max(num, 1))
-
-
-def change(figure: str, before: Any, now: Any) -> dict[str, float]:
-    """Return the changes of a figure (`Curve`, number or numbers of repeated draws), by name.
-
-    Those of a curve are of its outliers at equal coverage and of its coverage, in percent.
-    """
-    if isinstance(before, Mapping):
-        covered = min(coverage(before), coverage(now))
-        more = outliers_at(now, covered) - outliers_at(before, covered)
-        return {f"{figure} outliers": more, f"{figure} coverage": coverage(now) - coverage(before)}
-    return {figure: float(np.mean(now) - np.mean(before))}
-
-
-class Verdict(NamedTuple):
-    """The change of one figure over the keys of a group."""
-
-    figure: str  # name of the figure, with its unit
-    keys: Sequence[str]  # names of the keys
-    before: float  # mean over the keys before the change
-    now: float  # mean over the keys now
-    change: float  # mean change; of outliers, at equal coverage
-    error: float  # standard error of the mean change between keys; NaN with one key
-    luck: float  # standard deviation of the mean change by luck
-    worst: tuple[str, float]  # name of the key with the worst change, and that change
-    word: str  # "better", "worse" or "no difference"
-
-
-def verdicts(
-    before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, Any]
-) -> Iterator[Verdict]:
-    """Yield the verdict of each figure over all keys that both measurements have.
-
-    Measurements map key -> figure -> value; ``luck`` maps key -> name of a `change` -> its
-    deviation.
-    """
-    # Name of the change -> key -> before, now, change and its standard deviation by luck
-    changes: dict[str, dict[str, tuple[float, ...]]] = defaultdict(dict)
-    for key in [key for key in before if key in now]:
-        for figure in [figure for figure in before[key] if figure in now[key]]:
-            old, new = before[key][figure], now[key][figure]
-            for name, difference in change(figure, old, new).items():
-                sigma = luck.get(key, {}).get(name, 0.0)
-                if isinstance(old, Sequence):  # draws have luck of their own
-                    sigma = float(np.hypot(np.std(old), np.std(new)) / math.sqrt(2 * len(old)))
-                changes[name][key] = (_plain(name, old), _plain(name, new), difference, sigma)
-    for name, change_of_key in changes.items():
-        yield _verdict(name, change_of_key)
-
-
-def _verdict(name: str, change_of_key: Mapping[str, tuple[float, ...]]) -> Verdict:
-    """Return the verdict of a figure over its keys."""
-    old, new, difference, sigma = np.array(list(change_of_key.values())).T
-    loss = difference if _is_cost(name) else -difference
-    num_keys = len(difference)
-    error = float(difference.std(ddof=1) / math.sqrt(num_keys)) if num_keys > 1 else math.nan
-    # Both measurements have luck.
-    by_luck = float(np.sqrt(2 * (sigma**2).sum()) / num_keys)
-    limit = _BEYOND * max(by_luck, 0.0 if math.isnan(error) else error)
-    word = "no difference"
-    if abs(difference.mean()) > limit:
-        word = "worse" if loss.mean() > 0 else "better"
-    worst = int(loss.argmax())
-    return Verdict(
-        figure=name,
-        keys=list(change_of_key),
-        before=float(old.mean()),
-        now=float(new.mean()),
-        change=float(difference.mean()),
-        error=error,
-        luck=by_luck,
-        worst=(list(change_of_key)[worst], float(difference[worst])),
-        word=word,
-    )
-
-
-def beyond_luck(
-    before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
-) -> dict[str, float]:
-    """Return name -> change of those figures of a key that are worse by more than luck explains.
-
-    Args:
-        before: Figures of the key by name, first measurement; ``now`` has the second.
-        luck: Name of a `change` -> its standard deviation.
-        sigmas: Limit, in standard deviations of the difference of two measurements.
-    """
-    worse = {}
-    for figure in before:
-        for name, difference in change(figure, before[figure], now[figure]).items():
-            loss = difference if _is_cost(name) else -difference
-            if loss > sigmas * math.sqrt(2) * luck[name]:
-                worse[name] = difference
-    return worse
-
-
-def _is_cost(name: str) -> bool:
-    """Return True for a figure that is better if it is lower."""
-    return not name.endswith(("coverage", "recall %"))
-
-
-def _plain(name: str, value: Any) -> float:
-    """Return a figure as a number: of a curve, its coverage or all its outliers in percent."""
-    if isinstance(value, Mapping):
-        covered = coverage(value)
-        return covered if name.endswith("coverage") else outliers_at(value, covered)
-    return float(np.mean(value))
-
+from densify.scores.metrics import (
+    DepthErrors,
+    end_point_errors,
+    errors_by_part,
+    mean_errors,
+    window_pose_errors,
+)
 
 KINDS = ("depth", "flow", "registration")
 _WINDOW = 5
@@ -300,7 +164,7 @@ def measure(
 ) -> Stored:
     """Return figures and their luck, the standard deviation of each `change` over ``draws``.
 
-    Figures are curves of outliers (`densify.bench.gate.Curve`) of the measured and the filled
+    Figures are curves of outliers (`densify.bench.verdicts.Curve`) of the measured and the filled
     map; recall, errors and false positives of the scene flow; errors of poses. Flow between two
     sweeps is estimated in eight draws with moved poses.
 
@@ -575,3 +439,77 @@ def _pair_truth(key: GateKey, truth: Truth | None, first: Sweep) -> tuple[Float,
     static = ~truth.sweep(key.key).moving[first.row]
     moving = ~static & (np.linalg.norm(points[:, :2], axis=1) < _PAIR_REACH_M)
     return true_m, moving, static
+
+
+_FARTHEST_M = 100.0  # of inverted depths
+_DIAMOND = np.array(
+    [[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8
+)
+_SINGLE_SWEEP = {"accumulate": {"far_m": 0}}
+
+
+KEYS_OF_TRUTH: Mapping[str, tuple[GateKey, ...]] = {
+    "KITTI, stereo": tuple(key for key in KEYS if key.truth == "stereo"),
+    "PandaSet, second scanner": tuple(key for key in KEYS if key.truth == "scanner"),
+    "street, exact": tuple(key for key in KEYS if key.data == "street?seed=301"),
+}
+"""Name of a truth -> keys that it scores."""
+
+
+def errors_of_methods(
+    keys: Sequence[GateKey], folder: Path | None
+) -> dict[str, dict[str, DepthErrors]]:
+    """Return method -> part of the pixels (as `errors_by_part`) -> mean errors over the keys."""
+    errors: dict[str, dict[str, list[DepthErrors]]] = {}
+    for key in keys:
+        subject = Subject.of(key, folder, None)
+        truth = cast(TruthMap, subject.truth)  # none of these keys is held out
+        focal_px = subject.camera.focal_px
+        for method, depth_m in _maps(subject).items():
+            parts = errors_by_part(
+                depth_m,
+                truth.depth_m,
+                truth.moving,
+                focal_px=focal_px,
+                baseline_m=truth.baseline_m,
+            )
+            for part, of_key in parts.items():
+                errors.setdefault(method, {}).setdefault(part, []).append(of_key)
+    return {
+        method: {part: mean_errors(of_keys) for part, of_keys in parts.items()}
+        for method, parts in errors.items()
+    }
+
+
+def _maps(subject: Subject) -> dict[str, Float32]:
+    """Return name of the method -> its map (H,W) in metres."""
+    key, camera = subject.key.key, subject.key.camera
+    results = densify(subject.recording, key, ["none", "icp", "flow"], [camera], Watch())
+    sweep_m, ours = results["none"].depth[camera].depth_m, results["flow"].depth[camera]
+    alone = Recording(subject.recording.sequence, resolve(_SINGLE_SWEEP), 0, [key])
+    single = densify(alone, key, ["flow"], [camera], Watch())["flow"].depth[camera]
+    return {
+        "single sweep": sweep_m,
+        "single sweep, filled": single.filled_m,
+        "single sweep, IP-Basic": ip_basic(sweep_m),
+        "rigid (ICP)": results["icp"].depth[camera].depth_m,
+        "densify, measured": ours.depth_m,
+        "densify, filled": ours.filled_m,
+    }
+
+
+def ip_basic(sparse_m: Float32) -> Float32:
+    """Return a map filled by dilation and closing, (H,W) metres, 0 where nothing is near.
+
+    ``sparse_m`` is (H,W) metres, 0 for none. Source: Ku, Harakeh, Waslander, "In Defense of
+    Classical Image Processing: Fast Depth Completion on the CPU", CRV 2018, not extended upwards.
+    """
+    has_depth = (sparse_m > 0) & (sparse_m < _FARTHEST_M)
+    inverted = np.where(has_depth, np.float32(_FARTHEST_M) - sparse_m, np.float32(0))
+    inverted = np.asarray(cv2.dilate(inverted, _DIAMOND), np.float32)
+    inverted = cv2.morphologyEx(inverted, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    for size in (7, 31):
+        dilated = cv2.dilate(inverted, np.ones((size, size), np.uint8))
+        inverted = np.where(inverted > 0, inverted, dilated).astype(np.float32)
+    blurred = cv2.GaussianBlur(cv2.medianBlur(inverted, 5), (5, 5), 0)
+    return np.where(inverted > 0, np.float32(_FARTHEST_M) - blurred, 0).astype(np.float32)

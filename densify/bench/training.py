@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from densify.bench.depth import Altered, TruthMap, ip_basic, without_scanner
-from densify.bench.gate import KEYS, GateKey, Subject
+from densify.bench.depth import Altered, TruthMap, without_scanner
+from densify.bench.gate import KEYS, GateKey, Subject, ip_basic
 from densify.config import resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
@@ -32,7 +32,7 @@ from densify.pipeline.recording import Recording
 from densify.pipeline.run import densify
 from densify.readers import open_sequence
 from densify.readers.timeline import choose_cameras
-from densify.scores.depth_metrics import errors_by_part, mean_errors
+from densify.scores.metrics import errors_by_part, mean_errors
 
 _WINDOW = 5
 _METHODS = ("none", "icp", "icp-visible", "flow")

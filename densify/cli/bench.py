@@ -10,19 +10,19 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from densify.bench import depth, gate, paper, training
+from densify.bench import gate, paper, training
 from densify.bench.depth import bench_depth
 from densify.bench.doctor import bench_doctor
 from densify.bench.flow import DEFAULT_METHODS, bench_flow, tables
-from densify.bench.gate import verdicts
 from densify.bench.training import mean_and_error
+from densify.bench.verdicts import verdicts
 from densify.cli.options import config_of, recording_of, recordings_of
 from densify.cli.screen import Answer, aligned, numbers_table, percent, progress_on_stderr, written
 from densify.config import as_mapping, resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError
 from densify.readers import open_sequence
-from densify.scores.depth_metrics import LEAST_PIXELS, DepthErrors
+from densify.scores.metrics import LEAST_PIXELS, DepthErrors
 
 _KEYS = [120]
 _FIGURES = {
@@ -107,10 +107,10 @@ def answer_bench_baselines(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify bench baselines``: yield the errors of simpler maps and ours, by truth."""
     folder = _recordings_folder(options)
     titles = ["", "part", "pixels", "coverage", "outliers", "over 1 px", "MAE"]
-    for truth, keys in depth.GROUPS.items():
+    for truth, keys in gate.KEYS_OF_TRUTH.items():
         if folder is None and keys[0].is_real:
             continue
-        errors = depth.errors_of_methods(keys, folder)
+        errors = gate.errors_of_methods(keys, folder)
         rows = [
             [f"{truth}: {method}", part, *_error_cells(of_part)]
             for method, parts in errors.items()

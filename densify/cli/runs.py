@@ -38,7 +38,7 @@ from densify.pipeline.key_result import USUAL
 from densify.readers import Spec, open_sequence
 from densify.readers.depth_trees import pair_depth_files
 from densify.readers.timeline import format_frames
-from densify.scores.depth_metrics import LEAST_PIXELS
+from densify.scores.metrics import LEAST_PIXELS
 
 _FIRST_OF_RUN = {
     "report.html": "all of it, in a browser",

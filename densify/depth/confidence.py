@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from densify.depth.project import ALL_ROUND, MapRecord
+from densify.depth.measured_pixels import ALL_ROUND, MapRecord
 from densify.geometry.types import Bool, Camera, DepthMap, Float, Float32, Int
-from densify.scores.depth_metrics import (
+from densify.scores.metrics import (
     DECADES,
     KITTI_BASELINE_M,
     OUTLIER_FRACTION,

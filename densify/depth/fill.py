@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from densify.depth.measured_pixels import MapRecord
 from densify.depth.patches import (
     AGREE_FRACTION,
     AGREE_M,
@@ -25,7 +26,6 @@ from densify.depth.patches import (
     limit_inverse,
     plane,
 )
-from densify.depth.project import MapRecord
 from densify.geometry.arrays import Bool, Float, Float32, Int
 from densify.geometry.compiled import Kernel, inlined
 

@@ -17,8 +17,8 @@ from scipy.sparse.linalg import cg
 
 from densify.depth.exposure import Exposure, pixel_of
 from densify.depth.fill import LEAST_SHARE, ROUNDED, VOTERS_REACH, votes_for
+from densify.depth.measured_pixels import MapRecord
 from densify.depth.patches import FOOTPRINT, HIDDEN_M, agree_m, hidden_m
-from densify.depth.project import MapRecord
 from densify.depth.rays import MovingBody, find_crossing, half_spaces
 from densify.geometry import cameras
 from densify.geometry.arrays import Bool, Float, Float32, Int

@@ -16,9 +16,10 @@ from densify.depth.confidence import nearest_pixel, reliability, tolerance, with
 from densify.depth.exposure import Exposure, InView, Shot, pixel_of
 from densify.depth.far import far_cloud
 from densify.depth.fill import to_lab
+from densify.depth.measured_pixels import MapInputs
 from densify.depth.moving_bodies import find_far_inside, fronts
 from densify.depth.patches import find_patches, hidden_m
-from densify.depth.project import MapInputs, project
+from densify.depth.project import project
 from densify.depth.rays import MovingBody, Rays, find_moving_bodies, without_sweep
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
@@ -39,8 +40,8 @@ from densify.geometry.types import (
     Sweep,
     Truth,
 )
-from densify.scores import depth_metrics
 from densify.scores.edge_fit import is_off, silhouettes_of
+from densify.scores.metrics import depth_scores, precision_density, shares_by_motion
 
 _MISALIGNED = (
     "image edges do not lie on depth discontinuities (calibration, clock?): the image is not used, "
@@ -411,8 +412,8 @@ class HeldOut:
             camera = self.views.exposures[name].camera
             depth_map = with_max_outliers(judged_map, self.views.settings.max_outliers)
             scores[name] = {
-                **depth_metrics.depth_scores(depth_map, truth_m, moving, camera),
-                "curve": depth_metrics.precision_density(depth_map, truth_m, camera),
+                **depth_scores(depth_map, truth_m, moving, camera),
+                "curve": precision_density(depth_map, truth_m, camera),
                 "reliability": reliability(depth_map, truth_m, camera),
                 "unjudged": self._unjudged_shares(name, depth_map, seen.bodies),
             }
@@ -427,4 +428,4 @@ class HeldOut:
         unjudged = to_return_px > self.gap_rad * exposure.camera.focal_px
         filled = depth_map.filled_m > 0
         moving = fronts(bodies.values(), exposure) > 0
-        return depth_metrics.shares_by_motion(unjudged[filled], moving[filled])
+        return shares_by_motion(unjudged[filled], moving[filled])

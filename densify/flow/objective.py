@@ -20,8 +20,7 @@ from scipy.spatial import cKDTree
 
 from densify.config import Config, ObjectiveSettings
 from densify.config.errors import InputError
-from densify.flow.chained import ChainedMotion
-from densify.flow.engines import Scene
+from densify.flow.engines import ChainedMotion, Scene
 from densify.flow.graph import checked_cloud, knn_graph, laplacian
 from densify.flow.pair_groups import MIN_MOTION_M, PairCloud, RigidMotion, judge
 from densify.flow.tracking.candidates import LINK_M

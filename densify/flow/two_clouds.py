@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from densify.config import Config, resolve
 from densify.config.errors import InputError
-from densify.flow.chained import ChainedMotion
-from densify.flow.engines import Scene
+from densify.flow.engines import ChainedMotion, Scene
 from densify.flow.graph import checked_cloud
 from densify.flow.objective import flow_between
 from densify.flow.pair_groups import PairCloud, find_movers

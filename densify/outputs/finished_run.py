@@ -32,8 +32,7 @@ from densify.outputs.depth_png import (
     stored_age,
     stored_confidence,
 )
-from densify.outputs.folders import plain
-from densify.outputs.key_outputs import writing
+from densify.outputs.folders import plain, writing
 from densify.readers import checks
 from densify.readers.decoded_files import decode_image
 from densify.version import __version__

@@ -215,3 +215,35 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value
+
+
+@contextmanager
+def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
+    """Yield the `staged_folder` if entries ``owned`` can be written; else raise InputError."""
+    check_folder(folder, owned, out, overwrite)
+    with staged_folder(folder, owned) as staging:
+        yield staging
+
+
+def check_folder(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> None:
+    """Raise InputError unless the entries ``owned`` can be written into a folder below ``out``."""
+    existing = folder
+    while not os.path.lexists(existing):
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(
+            f"--out {out}: {existing} is not a folder; choose another one with --out DIR"
+        )
+    # An existing folder is renamed, and a new folder beside it takes its place.
+    parents = [Path(os.path.realpath(existing)).parent] if existing == folder else []
+    for touched in (existing, *parents):
+        if not os.access(touched, os.W_OK | os.X_OK):
+            raise InputError(
+                f"--out {out}: no permission to write in {touched}; choose another one with --out"
+            )
+    present = [name for name in owned if (folder / name).exists()]
+    if present and not overwrite:
+        raise InputError(
+            f"{folder}: {', '.join(present)} already there and kept; "
+            f"give --overwrite to replace them or another --out DIR"
+        )

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import os
 import platform
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from densify.config.errors import InputError
 from densify.geometry.types import Result
 from densify.outputs import flow_writers, plots
 from densify.outputs.cloud_files import write_cloud
@@ -28,7 +26,14 @@ from densify.outputs.depth_png import (
     write_depth_png,
     write_flow_png,
 )
-from densify.outputs.folders import check_recording, plain, staged_folder, write_file, write_json
+from densify.outputs.folders import (
+    check_folder,
+    check_recording,
+    plain,
+    write_file,
+    write_json,
+    writing,
+)
 from densify.outputs.report_page import KeyFiles, key_page
 from densify.version import __version__
 
@@ -44,7 +49,7 @@ def check_writable(
     out: Path, key: int, overwrite: bool = False, verb: Literal["run", "compare"] = "run"
 ) -> None:
     """Raise InputError if a result of ``verb`` cannot be written. No file is changed."""
-    _check_folder(_key_folder(out, key), _RUN if verb == "run" else _COMPARISON, out, overwrite)
+    check_folder(_key_folder(out, key), _RUN if verb == "run" else _COMPARISON, out, overwrite)
 
 
 def write_result(
@@ -95,38 +100,6 @@ def write_comparison(
         for write in (_write_maps, _write_cloud, _write_tracks, _write_scene):
             write(last, folder / "compare")
     return _written(_key_folder(out, last.key), _COMPARISON)
-
-
-@contextmanager
-def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield the `staged_folder` if entries ``owned`` can be written; else raise InputError."""
-    _check_folder(folder, owned, out, overwrite)
-    with staged_folder(folder, owned) as staging:
-        yield staging
-
-
-def _check_folder(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> None:
-    """Raise InputError unless the entries ``owned`` can be written into a folder below ``out``."""
-    existing = folder
-    while not os.path.lexists(existing):
-        existing = existing.parent
-    if not existing.is_dir():
-        raise InputError(
-            f"--out {out}: {existing} is not a folder; choose another one with --out DIR"
-        )
-    # An existing folder is renamed, and a new folder beside it takes its place.
-    parents = [Path(os.path.realpath(existing)).parent] if existing == folder else []
-    for touched in (existing, *parents):
-        if not os.access(touched, os.W_OK | os.X_OK):
-            raise InputError(
-                f"--out {out}: no permission to write in {touched}; choose another one with --out"
-            )
-    present = [name for name in owned if (folder / name).exists()]
-    if present and not overwrite:
-        raise InputError(
-            f"{folder}: {', '.join(present)} already there and kept; "
-            f"give --overwrite to replace them or another --out DIR"
-        )
 
 
 def _key_folder(out: Path, key: int) -> Path:

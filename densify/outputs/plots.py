@@ -17,13 +17,13 @@ import numpy as np
 from densify.geometry.types import METHOD_NAMES, CameraView, Float, Float32, Result
 from densify.outputs.depth_png import Picture, encode_png
 from densify.outputs.folders import write_file
-from densify.scores.depth_metrics import precision_density
+from densify.scores.metrics import precision_density
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Curve = Sequence[Mapping[str, Any]]
-"""Points of outliers over density, see `densify.scores.depth_metrics.precision_density`."""
+"""Points of outliers over density, see `densify.scores.metrics.precision_density`."""
 
 _DPI = 100
 # Figures over images are drawn with OpenCV: a run should not wait for matplotlib.

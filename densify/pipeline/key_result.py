@@ -30,8 +30,7 @@ from densify.pipeline.process import Watch
 from densify.pipeline.recording import FarSurfaces, Moment
 from densify.readers.prior_files import PriorFiles
 from densify.registration.deskew import find_compensated
-from densify.scores import depth_metrics
-from densify.scores.metrics import ghost_scores
+from densify.scores.metrics import depth_scores, ghost_scores, image_density, scores_by_motion
 
 _log = logging.getLogger("densify")
 
@@ -232,8 +231,8 @@ def _score(
         "num_moving": int(cloud.moving.sum()),
         "density": {
             name: {
-                "measured": depth_metrics.image_density(depth_map.depth_m),
-                "filled": depth_metrics.image_density(depth_map.filled_m),
+                "measured": image_density(depth_map.depth_m),
+                "filled": image_density(depth_map.filled_m),
             }
             for name, depth_map in depth_maps.items()
         },
@@ -242,7 +241,7 @@ def _score(
     if scene.truth:
         cameras = {name: scene.views.exposures[name].camera for name in depth_maps}
         metrics["depth"] = {
-            name: depth_metrics.depth_scores(depth_maps[name], *true, cameras[name])
+            name: depth_scores(depth_maps[name], *true, cameras[name])
             for name, true in scene.truth.items()
         }
         metrics["reliability"] = {
@@ -285,9 +284,9 @@ def complete_with_prior(
             )
         prior_alone_m = np.where(completed.from_prior, completed.depth_m, np.float32(0))
         for product, depth_m in (("full", completed.depth_m), ("prior", prior_alone_m)):
-            metrics["density"][name][product] = depth_metrics.image_density(depth_m)
+            metrics["density"][name][product] = image_density(depth_m)
             if name in scene.truth:
-                metrics["depth"][name][product] = depth_metrics.scores_by_motion(
+                metrics["depth"][name][product] = scores_by_motion(
                     depth_m, *scene.truth[name], shots[name].camera
                 )
     return replace(result, full=full, metrics=metrics)

@@ -18,8 +18,7 @@ from densify.pipeline.recording import Recording
 from densify.readers.timeline import format_frames
 from densify.registration.deskew import find_compensated
 from densify.registration.trajectory import find_trajectory
-from densify.scores.depth_metrics import image_density
-from densify.scores.metrics import RecordedError, main_error
+from densify.scores.metrics import RecordedError, image_density, main_error
 
 _LEAST_DENSITY = 0.001  # share of the pixels; sixteen rings alone measure 0.005
 _SLOW_S = 0.15  # period of sweeps; at 5 Hz the motion of a truck along its own side is ambiguous

@@ -32,8 +32,7 @@ from numpy.typing import NDArray
 
 from densify.config import Config
 from densify.config.errors import InputError
-from densify.flow.chained import ChainedMotion
-from densify.flow.engines import Scene
+from densify.flow.engines import ChainedMotion, Scene
 from densify.geometry import poses
 from densify.geometry.types import Bool, Float, FlowField, Motion, Stretch
 from densify.readers.decoded_files import read_arrays, read_arrow
