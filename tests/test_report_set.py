@@ -107,6 +107,7 @@ def test_a_key_leads_to_its_own_page_and_many_keys_have_a_histogram(described: P
     write_manifest(described, *keys)
     page = page_of(described)
     assert '<a href="000001/report.html">key 1</a>' in page and "<rect" in page
+    assert page.count('class="usual"') == 2  # of ghosts and measured depth
     assert set(re.findall(r'<a href="#(row.*?)"', page)) <= set(re.findall(r'id="(row.*?)"', page))
 
 

@@ -74,11 +74,11 @@ class _Score(NamedTuple):
     unit: str = "%"
 
     def of(self, record: KeyRecord) -> float | None:
-        """Return the score of a key in ``unit``, the mean over its cameras; None if unknown."""
+        """Return the score of a key's worst camera in ``unit``; None if unknown."""
         if self.name == "seconds":
             return record.seconds
         values = record.values_of(self.name)
-        return 100 * float(np.mean(values)) if values else None
+        return 100 * (max(values) if self.is_bad > 0 else min(values)) if values else None
 
     def usual(self) -> list[float]:
         """Return the ends of the range on KITTI in ``unit``, [] if unknown."""
@@ -176,12 +176,16 @@ def _chosen_for_pictures(worst_first: Sequence[KeyRecord]) -> list[KeyRecord]:
 def _state(made: _Set, command: str) -> str:
     """Return how many keys the set has, what they cost, and how to make the others."""
     counts = Counter[str](record.status for record in made.records)
-    names = {"done": "done", "aside": "put aside", "failed": "failed"}
-    parts = [f"{counts[status]:,} {name}" for status, name in names.items() if counts[status]]
+    words = {"done": "done", "aside": "put aside", "failed": "failed"}
+    parts = [f"{counts[status]:,} {word}" for status, word in words.items() if counts[status]]
     planned, tried = planned_keys(made.table), {record.name for record in made.records}
     num_left = len(planned - tried)
     parts += [f"{num_left:,} to make"] if num_left else []
-    state = html.escape("; ".join(filter(None, [", ".join(parts), describe_pace(made.records)])))
+    names = list(made.drives)
+    recordings = names[0] if len(names) == 1 else f"{len(names):,} recordings"
+    source = f"{recordings}, densify {made.table['densify']}"
+    pace = describe_pace(made.records)
+    state = html.escape("; ".join(filter(None, [source, ", ".join(parts), pace])))
     if not num_left:
         return state
     kind = "Preview" if command else "Not finished"
@@ -260,7 +264,7 @@ def _plot(score: _Score, made: _Set) -> str:
         if (record.status == "aside" or record.name in shown)
         if (value := score.of(record)) is not None
     ]
-    return score_plot(score.title, score.unit, dots)
+    return score_plot(score.title, score.unit, dots, score.usual())
 
 
 def _anchor(kind: str, record: KeyRecord) -> str:

@@ -173,10 +173,14 @@ class Dot(NamedTuple):
     target: str  # identifier of the element of the page that the dot leads to
 
 
-def score_plot(title: str, unit: str, dots: Sequence[Dot]) -> str:
+def score_plot(title: str, unit: str, dots: Sequence[Dot], usual: Sequence[float] = ()) -> str:
     """Return SVG with a score over the frame numbers of each recording, from 20 keys a histogram.
 
-    ``dots`` are ordered by recording and frame.
+    Args:
+        title: Name of the score.
+        unit: Unit of its values.
+        dots: The keys, ordered by recording and frame.
+        usual: Lowest and highest usual value, drawn as a band; empty for none.
     """
     largest = max((dot.value for dot in dots), default=0.0) or 1.0
     power = 10.0 ** np.floor(np.log10(largest))
@@ -184,6 +188,12 @@ def score_plot(title: str, unit: str, dots: Sequence[Dot]) -> str:
     scale_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / end  # per unit of the score
     (width_px, height_px), left_px = _PLOT_PX, _LABELS_PX
     parts = [f'<text x="{left_px}" y="14" class="title">{html.escape(title)}, {unit}</text>']
+    if usual:
+        top, bottom = (_PLOT_BASE_PX - min(value, end) * scale_px for value in reversed(usual))
+        parts.append(
+            f'<rect x="{left_px}" y="{top:.1f}" width="{width_px - left_px}" '
+            f'height="{bottom - top:.1f}" class="usual"><title>usual on KITTI</title></rect>'
+        )
     for tick in (0.0, end / 2, end):
         y = _PLOT_BASE_PX - tick * scale_px
         parts.append(f'<path d="M{left_px} {y:.1f}H{width_px}"/>')
