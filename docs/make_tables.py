@@ -11,17 +11,19 @@ a figure as a link to its table.
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from densify.bench import gate
 from densify.bench.training import mean_and_error
 from densify.bench.verdicts import coverage, outliers_at
+from densify.cli.commands import command_line
 from densify.scores.metrics import LEAST_PIXELS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -213,6 +215,44 @@ def rows_of_parts(truth: str, methods: Any, error: str) -> list[list[str]]:
     return rows
 
 
+def commands() -> str:
+    """Return a heading for each command, with what it does and a table of its options."""
+    return "\n" + "\n\n".join(blocks_of(command_line())) + "\n"
+
+
+def blocks_of(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """Yield the heading, text and table of options of a command, or of those in its group."""
+    groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for choices in groups:
+        for command in choices.choices.values():
+            yield from blocks_of(command)
+    if not groups:
+        rows = [
+            [f"`{spelled(action)}`", plain(action.help)]
+            for action in parser._actions
+            if "-h" not in action.option_strings
+        ]
+        yield f"## {parser.prog}"
+        yield plain(parser.description)
+        yield table(["option", "meaning"], rows)
+        if parser.epilog:
+            yield plain(parser.epilog)
+
+
+def plain(text: str | None) -> str:
+    """Return a text without marks of Markdown, and without the folder of the installed settings."""
+    text = re.sub(r"\S+/(default\.yaml)", r"configs/\1", text or "")
+    return re.sub(r"[|*<\[\]]", r"\\\g<0>", text)
+
+
+def spelled(action: argparse.Action) -> str:
+    """Return an option with the name of its value or its choices, as it is written."""
+    value = "{" + ",".join(map(str, action.choices)) + "}" if action.choices else action.metavar
+    value = "" if action.nargs == 0 else str(value or action.dest.upper())
+    value += " …" if action.nargs in ("+", "*") else ""
+    return " ".join(filter(None, [*action.option_strings, value])).replace("|", "\\|")
+
+
 def with_tables(page: str) -> str:
     """Return the text of a page with its tables made again."""
     numbers, stored = json.loads(NUMBERS.read_text()), gate.read(ROOT / "tests/gate.json")
@@ -223,6 +263,8 @@ def with_tables(page: str) -> str:
     def made(found: re.Match[str]) -> str:
         if found[2] == "cost":
             text = table(["task", "CPU", "elapsed", "memory"], numbers["cost"])
+        elif found[2] == "commands":
+            text = commands()
         elif found[2] in of_training:
             text = of_training[found[2]](numbers["training"])
         else:
