@@ -240,10 +240,10 @@ class Form(NamedTuple):
 
 
 EXPORTS = {
-    "npy": Form("export", ("depth", "depth_filled", "confidence"), of_drive=False),
-    "exr": Form("export", ("depth", "depth_filled", "confidence"), of_drive=False),
-    "ply": Form("export", ("cloud.ply",), of_drive=False),
-    "pcd": Form("export", ("cloud.pcd",), of_drive=False),
+    "npy": Form("finished_run", ("depth", "depth_filled", "confidence"), of_drive=False),
+    "exr": Form("finished_run", ("depth", "depth_filled", "confidence"), of_drive=False),
+    "ply": Form("finished_run", ("cloud.ply",), of_drive=False),
+    "pcd": Form("finished_run", ("cloud.pcd",), of_drive=False),
     "nerfstudio": Form("camera_exports", ("transforms.json", "images", "depth", "cloud.ply")),
     "colmap": Form("camera_exports", ("images", "sparse")),
     "splats": Form("camera_exports", ("images", "depths", "sparse", "movers", "tracks.json")),

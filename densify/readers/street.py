@@ -88,9 +88,9 @@ class Street:
         self._building = Lock()
         self._cache: Cache | None = Cache(folder=own_folder("street"))
         self._posed = f"{VERSION} {preset} {seed}{options}, with any sensor"
-        swept = f"{VERSION} {preset} {seed} {sensor}{options}"
+        self._swept = f"{VERSION} {preset} {seed} {sensor}{options}"
         pictured = f"{VERSION} {preset} {seed} {hz} Hz, with any sensor"
-        render = partial(self._from_cache, "sweep", swept, self.simulator.returns)
+        render = partial(self._from_cache, "sweep", self._swept, self.simulator.returns)
         self._returns = lru_cache(_SWEEPS_IN_MEMORY)(render)
         render = partial(self._from_cache, "image", pictured, self.simulator.picture)
         self._picture = lru_cache(_IMAGES_IN_MEMORY)(render)
