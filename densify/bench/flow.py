@@ -185,7 +185,7 @@ class Scorer:
         return Scorer(stretch, key, recording.searched_stretch(key), above, sources, truths, labels)
 
     def pooled_challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Return `challenge_scores` of frame -> flow towards the key; None without truth."""
+        """Return `challenge_scores` of frame -> flow towards the key sweep; None without truth."""
         if not self.labels:
             return None
         columns = []
@@ -196,7 +196,7 @@ class Scorer:
         return challenge_scores(*map(np.concatenate, zip(*columns, strict=True)))
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of frame -> flow to the neighbour towards the key sweep, pooled.
+        """Return the scores of each sweep's flow to its neighbour towards the key, pooled.
 
         ``found`` is the share of ``certain`` moving points that are called moving,
         ``falsely_moving`` that of static points, ground included. End-point errors in metres are
@@ -223,7 +223,7 @@ class Scorer:
         }
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of frame -> flow to the key sweep: ghost rate and, given truth, errors.
+        """Return the ghost rate of the sweeps' flow to the key (``to_key``) and, given truth, errors.
 
         Errors are metres, above the ground, by number of sweeps to the key: ``movers_m_by_hops`` of
         moving points, ``found_movers_m_by_hops`` of those called moving.

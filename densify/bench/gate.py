@@ -371,7 +371,7 @@ def _jitter(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
 
 
 def _thin(sweep: Sweep, seed: int) -> Sweep:
-    """Return the sweep with a random share of its returns."""
+    """Return the sweep with a random 98 % of its returns."""
     rng = np.random.default_rng([seed, sweep.frame])
     return sweep.select(rng.random(len(sweep)) < _KEPT)
 
@@ -486,7 +486,7 @@ def errors_of_methods(
 
 
 def _maps(subject: Subject) -> dict[str, Float32]:
-    """Return name of the method -> its map (H,W) in metres."""
+    """Return name of the method -> depth map (H,W) in metres, 0 for no depth."""
     key, camera = subject.key.key, subject.key.camera
     results = densify(subject.recording, key, ["none", "icp", "flow"], [camera], Watch())
     sweep_m, ours = results["none"].depth[camera].depth_m, results["flow"].depth[camera]

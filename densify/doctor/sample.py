@@ -58,7 +58,7 @@ class Finding:
 class Spot:
     """A spot: a few consecutive sweeps at one position in the recording."""
 
-    sweeps: tuple[Sweep, ...]  # raw sweeps, own vehicle included
+    sweeps: tuple[Sweep, ...]  # raw sweeps, ego vehicle included
     trajectory: Trajectory | None  # poses by odometry; None if registration failed
     failure: str = ""  # reason of the failure
 

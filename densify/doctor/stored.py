@@ -240,8 +240,8 @@ def check_axes(sample: Sample) -> list[Finding]:
 
 
 def _ground_share(sweep: Sweep, up: Float) -> float:
-    """Return the share of near returns in the fullest layer across ``up`` (3,) with few below."""
-    # The layer must begin below 0.3 m. Its share counts in excess of an even spread.
+    """Return the excess share of near returns in the fullest layer across ``up`` (3,)."""
+    # Few returns may lie below the layer, which begins below 0.3 m. An even spread is subtracted.
     height_m = sweep.points[np.linalg.norm(sweep.points, axis=1) < _NEAR_M] @ up
     if not len(height_m):
         return 0.0

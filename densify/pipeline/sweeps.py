@@ -22,7 +22,7 @@ BLOCK_S = 2.0
 
 
 class Sweeps:
-    """Reader of raw sweeps that drops the returns of the own vehicle."""
+    """Reader of raw sweeps that drops the returns of the ego vehicle."""
 
     def __init__(
         self,

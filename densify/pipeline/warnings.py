@@ -99,7 +99,7 @@ def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"{100 * share_below:.1f} % of the points lie below the ground, as mirror images of a "
             f"wet road and echoes over two surfaces do; they are left out"
         )
-    if share_near <= _MAX_NEAR:  # else sweeps may lack the returns of the own vehicle
+    if share_near <= _MAX_NEAR:  # else sweeps may lack the returns of the ego vehicle
         yield from _warn_of_sectors(recording, [sweep.frame for sweep in sweeps])
 
 
