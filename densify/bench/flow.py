@@ -223,7 +223,7 @@ class Scorer:
         }
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the ghost rate of the sweeps' flow to the key (``to_key``) and, given truth, errors.
+        """Return the ghost rate of the flow to the key (``to_key``), and errors if truth is known.
 
         Errors are metres, above the ground, by number of sweeps to the key: ``movers_m_by_hops`` of
         moving points, ``found_movers_m_by_hops`` of those called moving.

@@ -235,7 +235,7 @@ class Recording:
         return self._motion(piece, engine).with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return a sweep's flow to the next sweep of its window; at the window's end to the first."""
+        """Return a sweep's flow to the next sweep of its window, at its end to the first sweep."""
         window = self.window(frame)
         later = [other for other in window.frames if other > frame]
         earlier = [other for other in window.frames if other < frame]
