@@ -186,7 +186,7 @@ def test_looking_around_changes_no_window(long_street) -> None:
     ]
     recording = Recording(sequence, settings[1], 2, [8], looks_around=True)
     assert recording.window(8).frames == (6, 7, 8, 9, 10)
-    assert recording.searched(8).frames == tuple(range(2, 12))
+    assert recording.searched_stretch(8).frames == tuple(range(2, 12))
     plain, looking = (by_flow(sequence, 8, 2, config=config) for config in settings)
     assert looking.frames == plain.frames and looking.far_frames == plain.far_frames
     assert looking.metrics["num_moving"] == pytest.approx(plain.metrics["num_moving"], rel=0.02)

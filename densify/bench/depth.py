@@ -70,7 +70,7 @@ class TruthMap(NamedTuple):
     baseline_m: float = KITTI_BASELINE_M  # stereo baseline that turns depth into disparity
 
     def outliers(self, depth_m: Float32, focal_px: float) -> Bool:
-        """Return (H,W) True at outliers of a depth map (H,W), False where either has no depth."""
+        """Return a mask (H,W) of a depth map's outliers, False where either map has no depth."""
         known = (self.depth_m > 0) & (depth_m > 0)
         judged_m, true_m = (m[known].astype(np.float64) for m in (depth_m, self.depth_m))
         outliers = np.zeros(known.shape, bool)
@@ -160,7 +160,7 @@ def exact_truth(
     if key_sweep.scanner_origins is not None:
         from_scanner = from_scanner - key_sweep.scanner_origins[key_sweep.lidar]
     slope = from_scanner[:, 2] / np.linalg.norm(from_scanner[:, :2], axis=1)
-    top = np.quantile(slope, _TOP_QUANTILE)
+    top_slope = np.quantile(slope, _TOP_QUANTILE)
     for name, shot in shots.items():
         if shot.number is None:
             continue
@@ -168,9 +168,9 @@ def exact_truth(
         depth_m = sequence.truth.depth_m(camera.name, number)
         v, u = np.nonzero((depth_m > 0) & (depth_m <= _REACH_M))
         ray = rays(camera, np.stack([u, v], 1).astype(np.float64))
-        scale = depth_m[v, u] / depth_along(ray, camera.measure)
-        lidar = poses.transform(poses.inverse(camera.T_cam_lidar), ray * scale[:, None])
-        below = lidar[:, 2] <= top * np.linalg.norm(lidar[:, :2], axis=1)
+        range_m = depth_m[v, u] / depth_along(ray, camera.measure)
+        points = poses.transform(poses.inverse(camera.T_cam_lidar), ray * range_m[:, None])
+        below = points[:, 2] <= top_slope * np.linalg.norm(points[:, :2], axis=1)
         known_m = np.zeros_like(depth_m)
         known_m[v[below], u[below]] = depth_m[v[below], u[below]]
         moving = sequence.truth.moving_mask(camera.name, number)
@@ -196,11 +196,11 @@ def stereo_truth(folder: Path, frame: int, camera: Camera) -> TruthMap:
 
 
 def agrees_beside(truth: TruthMap, depth_m: Float32, reach_px: int, focal_px: float) -> Bool:
-    """Return (H,W) True where the true depth of a pixel in the same row agrees with a depth map.
+    """Return a mask (H,W), True where a true depth beside, in the same row, agrees with a map.
 
     Args:
-        depth_m: (H,W) depth in metres, 0 for none.
-        reach_px: Greatest distance of that pixel along the row.
+        depth_m: (H,W) depth in metres of the map, 0 for none.
+        reach_px: Greatest distance along the row.
         focal_px: Focal length, which outliers by disparity depend on.
     """
     agrees = np.zeros(depth_m.shape, bool)
@@ -283,11 +283,15 @@ class _Sums:
             focal_px = cameras[maps.camera].focal_px
             for product, depth_m in zip(PRODUCTS, (maps.depth_m, maps.filled_m), strict=True):
                 self._densities[product].append(image_density(depth_m))
-                for source, truth in [(s, t[name]) for s, t in truths.items() if name in t]:
+                truth_of = {
+                    title: of_maps[name] for title, of_maps in truths.items() if name in of_maps
+                }
+                for truth_name, truth in truth_of.items():
                     known, outliers = truth.depth_m > 0, truth.outliers(depth_m, focal_px)
                     masks = np.stack([known, known & (depth_m > 0), outliers])
-                    self._counts[source, product, "all"] += masks.sum(axis=(1, 2))
-                    self._counts[source, product, "moving"] += masks[:, truth.moving].sum(axis=1)
+                    num_moving = masks[:, truth.moving].sum(axis=1)
+                    self._counts[truth_name, product, "all"] += masks.sum(axis=(1, 2))
+                    self._counts[truth_name, product, "moving"] += num_moving
         for scores in (result.metrics.get("held_out") or {}).values():
             for product, group in cartesian(PRODUCTS, _GROUPS):
                 score = scores[product][group]
@@ -296,14 +300,14 @@ class _Sums:
                 self._counts["key held out", product, group] += counts
 
     def numbers(self, num_keys: int) -> dict[str, Any]:
-        """Return density, seconds and scores of a variant, see `bench_depth`."""
+        """Return density, seconds and scores of a variant, as `bench_depth` returns them."""
         scores: dict[str, Any] = {}
-        for (source, product, group), counts in self._counts.items():
-            num, compared, outliers = counts.tolist()
-            scores.setdefault(source, {}).setdefault(product, {})[group] = {
-                "num_pixels": num,
-                "coverage": compared / num if num else None,
-                "outliers": outliers / compared if compared else None,
+        for (truth_name, product, group), counts in self._counts.items():
+            num_pixels, num_compared, num_outliers = counts.tolist()
+            scores.setdefault(truth_name, {}).setdefault(product, {})[group] = {
+                "num_pixels": num_pixels,
+                "coverage": num_compared / num_pixels if num_pixels else None,
+                "outliers": num_outliers / num_compared if num_compared else None,
             }
         density = {product: float(np.mean(shares)) for product, shares in self._densities.items()}
         return {"density": density, "seconds": self._seconds / num_keys, "scores": scores}

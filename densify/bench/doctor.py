@@ -30,13 +30,21 @@ _AXES = ("pitch", "yaw", "roll")
 def bench_doctor(
     sequences: Sequence[LidarSequence], config: Config, progress: Progress | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Return error -> number of cases (``of``) and share of each verdict on recordings with it."""
+    """Inject known errors into recordings, and count the verdicts of the doctor's checks.
+
+    Args:
+        sequences: The recordings, taken as free of errors.
+        config: Settings, of which those of registration are used.
+
+    Returns:
+        Name of the error -> number of cases (``of``), and the share (0 to 1) of each verdict.
+    """
     counts: dict[str, Counter[Verdict]] = {}
     for number, sequence in enumerate(sequences):
         if progress:
             progress("recordings", number, len(sequences))
         sample = Sample.of(sequence, config.register)
-        for mistake, findings in (*_cameras(sample), *_poses(sample)):
+        for mistake, findings in (*_check_cameras(sample), *_check_poses(sample)):
             of_clock = "clock" in mistake
             # An error of a clock is judged by the checks of clocks, others by the other checks.
             verdicts = [
@@ -50,7 +58,7 @@ def bench_doctor(
     }
 
 
-def _cameras(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
+def _check_cameras(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
     """Yield the name of an error and the findings about a camera that has this error."""
     silhouettes: dict[int, Silhouettes] = {}
     for camera in sample.sequence.cameras.values():
@@ -79,7 +87,7 @@ def _with_mistakes(camera: Camera, views: list[View]) -> Iterator[tuple[str, Cam
             yield f"camera's clock {1000 * size:g} ms", camera, late
 
 
-def _poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
+def _check_poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
     """Yield the name of an error and the findings about poses that have this error."""
     sequence = sample.sequence
     stamp_ns, row = sample.timeline.stamp_ns, sample.timeline.row
@@ -89,25 +97,32 @@ def _poses(sample: Sample) -> Iterator[tuple[str, list[Finding]]]:
         return
     track = PoseTrack(sequence.name, stamp_ns, T_world_lidar)
 
-    def checked(scale: float = 1.0, climb_m_s: float = 0.0, late_s: float = 0.0) -> list[Finding]:
-        """Return the findings about poses of a wrong scale, with a climb, or of a late clock."""
-
-        def pose(frame: int) -> Float:
-            moment_ns = int(stamp_ns[row[frame]]) - round(1e9 * late_s)
+    def check_altered_poses(
+        scale: float = 1.0,  # factor of all distances from the first pose
+        climb_m_s: float = 0.0,  # vertical velocity that is added
+        late_s: float = 0.0,  # delay of the poses' clock
+    ) -> list[Finding]:
+        def altered_pose(frame: int) -> Float:
+            frame_ns = int(stamp_ns[row[frame]])
+            moment_ns = frame_ns - round(1e9 * late_s)
             T = track.at(int(np.clip(moment_ns, stamp_ns[0], stamp_ns[-1]))).copy()
-            T[:3, 3] = scale * (T[:3, 3] - T_world_lidar[0, :3, 3]) + T_world_lidar[0, :3, 3]
-            T[2, 3] += climb_m_s * (stamp_ns[row[frame]] - stamp_ns[0]) * 1e-9
+            start_m = T_world_lidar[0, :3, 3]
+            T[:3, 3] = scale * (T[:3, 3] - start_m) + start_m
+            T[2, 3] += climb_m_s * (frame_ns - int(stamp_ns[0])) * 1e-9
             return T
 
-        altered: Any = Altered(sequence, T_world_lidar=pose)
+        altered: Any = Altered(sequence, T_world_lidar=altered_pose)
         return check_poses(replace(sample, sequence=altered))
 
-    yield "poses as they are", checked()
-    yield "clock of poses as it is", checked()
+    yield "poses as they are", check_altered_poses()
+    yield "clock of poses as it is", check_altered_poses()
     for sign in (1, -1):
         for size in _SCALES:
-            yield f"poses {100 * size:g} % too long or short", checked(scale=1 + sign * size)
+            yield (
+                f"poses {100 * size:g} % too long or short",
+                check_altered_poses(scale=1 + sign * size),
+            )
         for size in _CLIMBS_M_S:
-            yield f"poses climb {size:g} m/s", checked(climb_m_s=sign * size)
+            yield f"poses climb {size:g} m/s", check_altered_poses(climb_m_s=sign * size)
         for size in _CLOCKS_S:
-            yield f"clock of poses {1000 * size:g} ms", checked(late_s=sign * size)
+            yield f"clock of poses {1000 * size:g} ms", check_altered_poses(late_s=sign * size)

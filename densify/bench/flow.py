@@ -96,7 +96,7 @@ def bench_flow(
     for done, method in enumerate(chosen):
         if progress is not None:
             progress(method, done, len(chosen))
-        steps, to_key, seconds = _flows(method, scorer, config)
+        steps, to_key, seconds = _estimate_flows(method, scorer, config)
         scores = {
             "seconds_per_pair": seconds / (len(frames) - 1),
             "step": scorer.step_scores(steps),
@@ -182,10 +182,10 @@ class Scorer:
             labels = {f: read_labelled_flow(folder, sequence.name, stretch, f) for f in sources}
         elif truths is not None:
             labels = {f: truths[f].as_label() for f in sources}
-        return Scorer(stretch, key, recording.searched(key), above, sources, truths, labels)
+        return Scorer(stretch, key, recording.searched_stretch(key), above, sources, truths, labels)
 
     def pooled_challenge_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any] | None:
-        """Return `challenge_scores` of frame -> flow towards the key; None without truth."""
+        """Return `challenge_scores` of frame -> flow towards the key sweep; None without truth."""
         if not self.labels:
             return None
         columns = []
@@ -196,7 +196,7 @@ class Scorer:
         return challenge_scores(*map(np.concatenate, zip(*columns, strict=True)))
 
     def step_scores(self, steps: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of frame -> flow to the neighbour towards the key sweep, pooled.
+        """Return the scores of each sweep's flow to its neighbour towards the key, pooled.
 
         ``found`` is the share of ``certain`` moving points that are called moving,
         ``falsely_moving`` that of static points, ground included. End-point errors in metres are
@@ -223,7 +223,7 @@ class Scorer:
         }
 
     def window_scores(self, to_key: Mapping[int, FlowField]) -> dict[str, Any]:
-        """Return the scores of frame -> flow to the key sweep: ghost rate and, given truth, errors.
+        """Return the ghost rate of the flow to the key (``to_key``), and errors if truth is known.
 
         Errors are metres, above the ground, by number of sweeps to the key: ``movers_m_by_hops`` of
         moving points, ``found_movers_m_by_hops`` of those called moving.
@@ -236,10 +236,10 @@ class Scorer:
         errors_m: dict[str, dict[str, list[Float]]] = {"movers": {}, "found_movers": {}}
         for frame, truth in self.truths.items():
             if frame != key:
-                field, hops = to_key[frame], str(abs(frames.index(key) - frames.index(frame)))
-                kept = truth.moving & self.above[frame] & ~field.lost
-                error_m = end_point_errors(field.displacement, truth.to_key)
-                for name, rows in (("movers", kept), ("found_movers", kept & field.moving)):
+                flow, hops = to_key[frame], str(abs(frames.index(key) - frames.index(frame)))
+                followed = truth.moving & self.above[frame] & ~flow.lost
+                error_m = end_point_errors(flow.displacement, truth.to_key)
+                for name, rows in (("movers", followed), ("found_movers", followed & flow.moving)):
                     errors_m[name].setdefault(hops, []).append(error_m[rows])
         for name, by_hops in errors_m.items():
             means = {hops: mean_of(np.concatenate(by_hops[hops])) for hops in sorted(by_hops)}
@@ -258,19 +258,19 @@ def towards(key: int, frame: int, frames: Sequence[int]) -> int:
     return frames[row + int(np.sign(frames.index(key) - row))]
 
 
-def _flows(
+def _estimate_flows(
     method: str, scorer: Scorer, config: Config
 ) -> tuple[dict[int, FlowField], dict[int, FlowField], float]:
-    """Return flow to the neighbour towards the key and flow to the key, by frame, and seconds."""
+    """Return frame -> flow to the neighbour towards the key, frame -> flow to the key; seconds."""
     stretch, key = scorer.stretch, scorer.key
     changes, frames = METHODS[method], stretch.frames
     if changes is None:
         still = {f: FlowField.zero(len(stretch[f].sweep)) for f in frames}
         return still, still, 0.0
     config = resolve(as_mapping(config), changes)
-    if method == "ours":  # compile before the clock starts
-        first = max(0, frames.index(key) - 1)
-        _motion(Stretch(stretch.sweeps[first : first + 3]), config)
+    if method == "ours":  # compile before the clock starts, by three sweeps around the key
+        begin = max(0, frames.index(key) - 1)
+        _motion(Stretch(stretch.sweeps[begin : begin + 3]), config)
     start = time.perf_counter()
     motion = _motion(scorer.around if method == "ours" else stretch, config, frames)
     steps = {f: motion.flow(f, towards(key, f, frames)) for f in frames if f != key}

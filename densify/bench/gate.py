@@ -131,7 +131,7 @@ class Stored(NamedTuple):
 
 
 def read(path: Path) -> Stored:
-    """Return the figures in a file that `write` wrote; raise InputError for other files."""
+    """Return the figures of a file that `write` wrote, and their luck; InputError for others."""
     try:
         return Stored(**json.loads(path.read_text("utf-8")))
     except (OSError, ValueError, TypeError) as error:
@@ -162,28 +162,30 @@ def measure(
     progress: Progress | None = None,
     cache: Cache | None = None,
 ) -> Stored:
-    """Return figures and their luck, the standard deviation of each `change` over ``draws``.
+    """Measure the figures of many keys, and return them with their luck.
 
-    Figures are curves of outliers (`densify.bench.verdicts.Curve`) of the measured and the filled
-    map; recall, errors and false positives of the scene flow; errors of poses. Flow between two
-    sweeps is estimated in eight draws with moved poses.
+    Luck is the standard deviation of each `change` over draws with moved poses. Figures are curves
+    of outliers (`densify.bench.verdicts.Curve`) of the measured and the filled map; recall, errors
+    and false positives of the scene flow; errors of poses. Flow between two sweeps is estimated in
+    eight draws with moved poses.
 
     Args:
         folder: Folder of the real recordings; None leaves them out.
         kinds: Some of `KINDS`.
         names: Names of the keys; None for all.
-        draws: Number of times that the poses are moved by 2 mm and 0.01°; luck is {} with 0.
+        draws: Number of times that the poses are moved by 2 mm and 0.01°; luck is {} with 0 or 1.
+        progress: Callback (stage, done, total).
         cache: Keeps registration and flow on disk, which pays if only depth changes.
     """
-    chosen = _chosen((*KEYS, *PAIRS), folder, names)
+    chosen = _choose_keys((*KEYS, *PAIRS), folder, names)
     figures: dict[str, dict[str, Any]] = {}
     luck: dict[str, dict[str, float]] = {}
     for number, key in enumerate(chosen):
         if key not in PAIRS:
             subject = Subject.of(key, folder, cache)
             figures[key.name] = subject.figures(kinds)
-            moved = [subject.figures(kinds, seed) for seed in range(draws)]
-            luck[key.name] = _luck(figures[key.name], moved)
+            draws_moved = [subject.figures(kinds, seed) for seed in range(draws)]
+            luck[key.name] = _find_luck(figures[key.name], draws_moved)
         elif "flow" in kinds:
             figures[key.name] = _pair_figures(key, folder)
         if progress is not None:
@@ -204,8 +206,11 @@ class JudgedMap(NamedTuple):
 def judged_maps(
     folder: Path | None, names: Collection[str] | None = None, cache: Cache | None = None
 ) -> Iterator[JudgedMap]:
-    """Yield the depth map of each of `KEYS` with its ground truth; arguments as for `measure`."""
-    for key in _chosen(KEYS, folder, names):
+    """Yield the map, truth and outliers of each of `KEYS`.
+
+    ``folder`` has the real recordings, None leaves these out. ``names`` None takes all keys.
+    """
+    for key in _choose_keys(KEYS, folder, names):
         subject = Subject.of(key, folder, cache)
         focal_px = subject.camera.focal_px
         depth, truth = subject.depth_and_truth(subject.recording, through_glass=False)
@@ -219,7 +224,7 @@ def judged_maps(
         yield JudgedMap(key, depth, truth, outlier)
 
 
-def _chosen(
+def _choose_keys(
     keys: Iterable[GateKey], folder: Path | None, names: Collection[str] | None
 ) -> list[GateKey]:
     """Return the keys with these names, None for all; real ones only with a folder."""
@@ -231,25 +236,25 @@ def _chosen(
     return [key for name, key in known.items() if names is None or name in names]
 
 
-def _opened(key: GateKey, folder: Path | None) -> LidarSequence:
+def _open(key: GateKey, folder: Path | None) -> LidarSequence:
     """Open the recording of a key, a real one in the folder of recordings."""
     return open_sequence(str(folder / key.data) if key.is_real and folder else key.data)
 
 
-def _luck(still: Mapping[str, Any], moved: list[dict[str, Any]]) -> dict[str, float]:
-    """Return the standard deviation of each change of figures when the poses move."""
-    changes: dict[str, list[float]] = defaultdict(list)
-    for figures in moved:
-        for name in still:
-            for title, value in change(name, still[name], figures[name]).items():
-                changes[title].append(value)
-    if len(moved) < 2:
+def _find_luck(figures: Mapping[str, Any], draws_moved: list[dict[str, Any]]) -> dict[str, float]:
+    """Return the standard deviation of each change of the figures when the poses move."""
+    if len(draws_moved) < 2:
         return {}
-    return {title: round(float(np.std(values, ddof=1)), 5) for title, values in changes.items()}
+    changes: dict[str, list[float]] = defaultdict(list)
+    for figures_moved in draws_moved:
+        for figure, value in figures.items():
+            for name, difference in change(figure, value, figures_moved[figure]).items():
+                changes[name].append(difference)
+    return {name: round(float(np.std(values, ddof=1)), 5) for name, values in changes.items()}
 
 
 class Subject(NamedTuple):
-    """A key as it is measured."""
+    """A key with the recording that is densified and the truth that its maps are compared with."""
 
     key: GateKey
     whole: LidarSequence  # recording with the returns that are the truth
@@ -259,7 +264,7 @@ class Subject(NamedTuple):
     @staticmethod
     def of(key: GateKey, folder: Path | None, cache: Cache | None) -> Subject:
         """Open the recording of a key, below ``folder`` if real, and find its true depth."""
-        whole, config = _opened(key, folder), resolve(None)
+        whole, config = _open(key, folder), resolve(None)
         sequence = without_scanner(whole, 1) if key.truth == "scanner" else whole
         recording = Recording(sequence, config, _WINDOW, [key.key], cache, looks_around=True)
         truth, cameras = None, choose_cameras(whole, [key.camera])
@@ -280,11 +285,14 @@ class Subject(NamedTuple):
         return self.whole.cameras[self.key.camera]
 
     def figures(self, kinds: Collection[str], seed: int | None = None) -> dict[str, Any]:
-        """Return name of the figure -> value; a seed moves the poses and thins the sweeps."""
+        """Return name of the figure -> value, of some of `KINDS`.
+
+        A ``seed`` moves the poses of depth and flow, and thins the sweeps that are registered.
+        """
         key, recording, registered = self.key.key, self.recording, self.recording
         if seed is not None:
-            recording = _Moved(self.recording, key, seed)
-            sequence: Any = Altered(recording.sequence, lambda sweep: _thinned(sweep, seed))
+            recording = _MovedRecording(self.recording, key, seed)
+            sequence: Any = Altered(recording.sequence, lambda sweep: _thin(sweep, seed))
             registered = Recording(sequence, recording.settings, _WINDOW, [key], looks_around=True)
         figures: dict[str, Any] = {}
         if "depth" in kinds:
@@ -319,13 +327,16 @@ class Subject(NamedTuple):
     def depth_and_truth(
         self, recording: Recording, through_glass: bool = True
     ) -> tuple[DepthMap, TruthMap]:
-        """Return the depth map of the key, and its truth, ``through_glass`` of bodies too."""
+        """Return the depth map of the key, and its truth.
+
+        ``through_glass`` False drops a scanner's returns from inside moving vehicles.
+        """
         key, camera, truth = self.key.key, self.key.camera, self.truth
         sequence, settings = recording.sequence, recording.settings
         shots = key_shots(sequence, choose_cameras(sequence, [camera]), key, settings.project)
         images, cloud = load_images(sequence, shots), recording.moment(key, True, "").cloud
-        far_surfaces = recording.find_far_surfaces(key)
-        scene = scene_of(recording, key, shots, images, far_surfaces, cloud, False, Watch())
+        far = recording.find_far_surfaces(key)
+        scene = scene_of(recording, key, shots, images, far, cloud, False, Watch())
         seen = see(scene, "flow", cloud)
         if truth is None:
             held_out = HeldOut.of(scene.views, cloud).judged_maps(seen, METHODS["flow"].visible)
@@ -338,29 +349,29 @@ class Subject(NamedTuple):
         return scene.views.depth_maps(seen)[camera], truth
 
 
-class _Moved(Recording):
-    """A recording with slightly other poses."""
+class _MovedRecording(Recording):
+    """A recording whose registered poses are moved slightly and at random."""
 
     def __init__(self, still: Recording, key: int, seed: int) -> None:
-        self._still, self._seed = still, seed
+        self._registered, self._seed = still, seed
         super().__init__(still.sequence, still.settings, _WINDOW, [key], looks_around=True)
 
     def registration(self, number: int) -> Registration:
-        registration = self._still.registration(number)
+        registration = self._registered.registration(number)
         rng = np.random.default_rng(self._seed)
-        pieces = tuple(_jittered(piece, rng) for piece in registration.pieces)
+        pieces = tuple(_jitter(piece, rng) for piece in registration.pieces)
         return Registration(pieces, registration.left_out)
 
 
-def _jittered(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
+def _jitter(trajectory: Trajectory, rng: np.random.Generator) -> Trajectory:
     """Return the trajectory with each pose moved by 2 mm and turned by 0.01° along each axis."""
     sigma = np.repeat([np.radians(_TURNED_DEG), _MOVED_M], 3)
     moves = poses.exp(sigma * rng.standard_normal((len(trajectory.frames), 6)))
     return replace(trajectory, T_world_lidar=trajectory.T_world_lidar @ moves)
 
 
-def _thinned(sweep: Sweep, seed: int) -> Sweep:
-    """Return the sweep with a random share of its returns."""
+def _thin(sweep: Sweep, seed: int) -> Sweep:
+    """Return the sweep with a random 98 % of its returns."""
     rng = np.random.default_rng([seed, sweep.frame])
     return sweep.select(rng.random(len(sweep)) < _KEPT)
 
@@ -396,21 +407,21 @@ def _flow_figures(recording: Recording, key: int) -> dict[str, float]:
 
 def _pair_figures(key: GateKey, folder: Path | None) -> dict[str, list[float]]:
     """Return figures of the flow from sweep ``key`` to the next, in draws with moved poses."""
-    sequence, config = _opened(key, folder), resolve({"register": {"source": "dataset"}})
+    sequence, config = _open(key, folder), resolve({"register": {"source": "dataset"}})
     window = Recording(sequence, config, 1, [key.key]).window(key.key)
-    start, end = window[key.key], window[key.key + 1]
-    T_start_end = poses.inverse(start.T_world_lidar) @ end.T_world_lidar
-    first, second = start.sweep, end.sweep
+    frames = key.key, key.key + 1
+    first, second = (window[frame].sweep for frame in frames)
     stamps_ns = np.array([first.stamp_ns, second.stamp_ns])
-    recorded = Trajectory((0, 1), stamps_ns, np.stack([np.eye(4), T_start_end]))
+    T_first_second = window.T_target_source(*frames)
+    recorded = Trajectory((0, 1), stamps_ns, np.stack([np.eye(4), T_first_second]))
     true_m, moving, static = _pair_truth(key, sequence.truth, first)
     rng = np.random.default_rng(0)
     figures: dict[str, list[float]] = defaultdict(list)
     for _ in range(_NUM_DRAWS):
-        T_first, T_second = _jittered(recorded, rng).T_world_lidar
+        T_world_first, T_world_second = _jitter(recorded, rng).T_world_lidar
         flow = estimate_flow(
             first.points,
-            poses.transform(poses.inverse(T_first) @ T_second, second.points),
+            poses.transform(poses.inverse(T_world_first) @ T_world_second, second.points),
             source_offset_ns=first.offset_ns,
             target_offset_ns=second.offset_ns,
             source_lidar=first.lidar,
@@ -426,10 +437,8 @@ def _pair_figures(key: GateKey, folder: Path | None) -> dict[str, list[float]]:
 
 
 def _pair_truth(key: GateKey, truth: Truth | None, first: Sweep) -> tuple[Float, Bool, Bool]:
-    """Return the true flow (N,3) of a pair's first sweep, and masks of the points scored by it.
-
-    The masks (N,) are of moving points and of static points, none if unknown.
-    """
+    """Return true flow (N,3) in metres of a pair's first sweep, and masks (N,): moving, static."""
+    # The masks select the scored points. Without known static points the second one is empty.
     points = first.points
     if truth is None:  # the pair of Argoverse 2
         is_near = np.linalg.norm(points - _CAR_M, axis=1) < _CAR_REACH_M
@@ -441,12 +450,11 @@ def _pair_truth(key: GateKey, truth: Truth | None, first: Sweep) -> tuple[Float,
     return true_m, moving, static
 
 
-_FARTHEST_M = 100.0  # of inverted depths
+_FARTHEST_M = 100.0  # depth that is inverted to 0; farther returns are not used
 _DIAMOND = np.array(
     [[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8
 )
 _SINGLE_SWEEP = {"accumulate": {"far_m": 0}}
-
 
 KEYS_OF_TRUTH: Mapping[str, tuple[GateKey, ...]] = {
     "KITTI, stereo": tuple(key for key in KEYS if key.truth == "stereo"),
@@ -467,11 +475,7 @@ def errors_of_methods(
         focal_px = subject.camera.focal_px
         for method, depth_m in _maps(subject).items():
             parts = errors_by_part(
-                depth_m,
-                truth.depth_m,
-                truth.moving,
-                focal_px=focal_px,
-                baseline_m=truth.baseline_m,
+                depth_m, truth.depth_m, truth.moving, focal_px=focal_px, baseline_m=truth.baseline_m
             )
             for part, of_key in parts.items():
                 errors.setdefault(method, {}).setdefault(part, []).append(of_key)
@@ -482,7 +486,7 @@ def errors_of_methods(
 
 
 def _maps(subject: Subject) -> dict[str, Float32]:
-    """Return name of the method -> its map (H,W) in metres."""
+    """Return name of the method -> depth map (H,W) in metres, 0 for no depth."""
     key, camera = subject.key.key, subject.key.camera
     results = densify(subject.recording, key, ["none", "icp", "flow"], [camera], Watch())
     sweep_m, ours = results["none"].depth[camera].depth_m, results["flow"].depth[camera]
@@ -499,11 +503,13 @@ def _maps(subject: Subject) -> dict[str, Float32]:
 
 
 def ip_basic(sparse_m: Float32) -> Float32:
-    """Return a map filled by dilation and closing, (H,W) metres, 0 where nothing is near.
+    """Return the (H,W) depth map, metres, that dilation and closing fill from a sparse map.
 
-    ``sparse_m`` is (H,W) metres, 0 for none. Source: Ku, Harakeh, Waslander, "In Defense of
-    Classical Image Processing: Fast Depth Completion on the CPU", CRV 2018, not extended upwards.
+    Pixels without a depth nearby stay 0. ``sparse_m`` is (H,W) metres, 0 for none. Source: Ku,
+    Harakeh, Waslander, "In Defense of Classical Image Processing: Fast Depth Completion on the
+    CPU", CRV 2018. Unlike there, columns are not extended upwards to the top of the image.
     """
+    # Inverted, the nearest depth of a neighbourhood is the largest, which dilation takes.
     has_depth = (sparse_m > 0) & (sparse_m < _FARTHEST_M)
     inverted = np.where(has_depth, np.float32(_FARTHEST_M) - sparse_m, np.float32(0))
     inverted = np.asarray(cv2.dilate(inverted, _DIAMOND), np.float32)

@@ -59,7 +59,7 @@ class PaperPair:
 
 
 Flow = Callable[[PaperPair, Int, Int], Float]
-"""Function of a pair and the rows drawn from its source and its target.
+"""Function of a pair, the rows drawn from its source, and the rows drawn from its target.
 
 It returns the flow of the drawn source points."""
 
@@ -126,36 +126,36 @@ def bench_paper(
             progress(pair.name, num_pairs, num_pairs + 1)
         num_pairs += 1
         for name, flow in flows.items():
-            measured[name].append(_measured(flow, pair, num_points))
+            measured[name].append(_score(flow, pair, num_points))
     if not num_pairs:
         raise InputError("densify bench paper: no pairs of sweeps; choose another recording")
     means = {name: _mean(rows) for name, rows in measured.items()}
     return {"num_pairs": num_pairs, "num_points": num_points, "methods": means}
 
 
-def _measured(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float]:
+def _score(method: Flow, pair: PaperPair, num_points: int) -> dict[str, float]:
     """Return the scores and the computing time of a method on one pair."""
     rng = np.random.default_rng(_SEED)
-    rows, targets = (_drawn(cloud, num_points, rng) for cloud in (pair.source, pair.target))
-    start = time.perf_counter()
+    rows, targets = (_draw_rows(cloud, num_points, rng) for cloud in (pair.source, pair.target))
+    begin_s = time.perf_counter()
     flow = method(pair, rows, targets)
-    seconds = time.perf_counter() - start
-    true = pair.flow[rows]
+    seconds = time.perf_counter() - begin_s
+    true_flow = pair.flow[rows]
     scores = {
-        "epe_m": metrics.end_point_error(flow, true),
-        "within_5": metrics.accuracy(flow, true, metrics.STRICT),
-        "within_10": metrics.accuracy(flow, true, metrics.RELAXED),
-        "angle_rad": metrics.angle_error_rad(flow, true),
+        "epe_m": metrics.end_point_error(flow, true_flow),
+        "within_5": metrics.accuracy(flow, true_flow, metrics.STRICT),
+        "within_10": metrics.accuracy(flow, true_flow, metrics.RELAXED),
+        "angle_rad": metrics.angle_error_rad(flow, true_flow),
         "seconds": seconds,
     }
     if pair.moving is not None:
         moving = pair.moving[rows]
-        scores["moving_m"] = metrics.end_point_error(flow, true, moving)
-        scores["static_m"] = metrics.end_point_error(flow, true, ~moving)
+        scores["moving_m"] = metrics.end_point_error(flow, true_flow, moving)
+        scores["static_m"] = metrics.end_point_error(flow, true_flow, ~moving)
     return scores
 
 
-def _drawn(points: Float, count: int, rng: np.random.Generator) -> Int:
+def _draw_rows(points: Float, count: int, rng: np.random.Generator) -> Int:
     """Return at most ``count`` ascending indices of random points within 35 m."""
     rows = np.flatnonzero(np.linalg.norm(points[:, :2], axis=1) < FARTHEST_M)
     return np.sort(rng.permutation(rows)[:count])
@@ -177,7 +177,7 @@ def has_truth(spec: str) -> bool:
 
 
 def pair_of_recording(spec: str, key: int) -> PaperPair:
-    """Return sweep ``key`` and the next, with the true flow, or without truth this package's."""
+    """Return sweep ``key`` and the next one, with the true flow, else this package's own flow."""
     sequence = open_sequence(spec)
     teacher, settings = "engine", resolve(None)
     if sequence.truth is not None:
@@ -202,7 +202,7 @@ def pairs_of_files(folder: Path, num_files: int) -> Iterator[PaperPair]:
 
 
 def read_pair(path: Path) -> PaperPair:
-    """Return the pair in an .npz file, without points farther than 35 m ahead."""
+    """Return the pair in an .npz file, without points farther than 35 m; InputError if damaged."""
     arrays = read_arrays(path)
     names = next((n for n in (_FLYINGTHINGS, _KITTI) if arrays.keys() >= set(n)), None)
     if names is None:

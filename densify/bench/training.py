@@ -82,7 +82,6 @@ TESTS: Mapping[str, tuple[GateKey, ...]] = {
 }
 """Name of a test -> keys whose truth it compares with. No network was trained on their sweeps."""
 
-
 TARGETS: Mapping[str, tuple[str, bool]] = {
     "single sweep held out": ("", False),
     "single sweep IP-Basic": ("ip-basic", False),
@@ -131,8 +130,8 @@ def bench_training(
     sets = [name for name in plan.sets if folder or not SETS[name][0].is_real]
     steps = SIZES[plan.network].steps if plan.steps is None else plan.steps
     plan = plan._replace(sets=sets, steps=steps)
-    maps = {name: _map_files(SETS[name], folder, out, progress) for name in sets}
-    tests = _tests(folder, out, progress)
+    maps = {name: _make_map_files(SETS[name], folder, out, progress) for name in sets}
+    tests = _read_tests(folder, out, progress)
     size = "" if plan.network == "small" else f"-{plan.network}"
     path = out / f"training{size}{'' if plan.with_returns else '-image-alone'}.json"
     stored = _read(path, {"steps": steps, "tests": [*tests]})
@@ -146,7 +145,7 @@ def bench_training(
     if UNTRAINED not in rows:
         untrained = Completion(plan.with_returns, plan.network).train(False)
         rows[UNTRAINED] = _errors(untrained, tests)
-    read = lru_cache(len(plan.targets))(lambda name, target: _samples(maps[name], target))
+    read = lru_cache(len(plan.targets))(lambda name, target: _read_samples(maps[name], target))
     for number, (row, (name, target, seed)) in enumerate(wanted.items()):
         if row not in rows:
             rows[row] = _errors(_train(read(name, target), plan, seed, number, progress), tests)
@@ -201,7 +200,7 @@ def _train(
     )
 
 
-def _map_files(
+def _make_map_files(
     parts: Sequence[Part], folder: Path | None, out: Path, progress: Progress | None
 ) -> list[Path]:
     """Make the maps of a training set that are missing, and return the files of all."""
@@ -217,7 +216,7 @@ def _map_files(
         ]
         if not missing:
             continue
-        recording = _opened(part, folder)
+        recording = _open(part, folder)
         for number, key in enumerate(missing):
             for camera, arrays in _make_maps(recording, key, part.cameras).items():
                 _write_arrays(files[part, key, camera], arrays)
@@ -237,7 +236,7 @@ def _write_arrays(path: Path, arrays: Arrays) -> None:
         np.savez_compressed(aside, **arrays)
 
 
-def _opened(part: Part, folder: Path | None) -> Recording:
+def _open(part: Part, folder: Path | None) -> Recording:
     """Open the sweeps of a part, without those before its first key and after its last."""
     whole = open_sequence(str(folder / part.data) if folder and part.is_real else part.data)
     sequence = whole if part.scanner is None else without_scanner(whole, part.scanner)
@@ -267,13 +266,17 @@ def _image(sequence: LidarSequence, key: int, camera: str) -> Arrays:
     return {"image": load_images(sequence, shots)[camera], "focal_px": focal_px}
 
 
-def _samples(files: Sequence[Path], target: str) -> list[Sample]:
+def _read_samples(files: Sequence[Path], target: str) -> list[Sample]:
     """Return the samples of a training set with depth maps of one kind."""
     samples, (name, by_confidence) = [], TARGETS[target]
     for path in files:
         with np.load(path, allow_pickle=False) as maps:
             sparse_m, weight = maps["none"], maps["confidence"] if by_confidence else None
-            depth_m = ip_basic(sparse_m) if name == "ip-basic" else maps[name] if name else None
+            depth_m = None  # the single sweep is trained with pixels of its own held out
+            if name == "ip-basic":
+                depth_m = ip_basic(sparse_m)
+            elif name:
+                depth_m = maps[name]
             image = maps["image"].transpose(2, 0, 1) / np.float32(255)
             focal_px = float(maps["focal_px"])
         samples.append(Sample.of(image, sparse_m, depth_m, weight, focal_px=focal_px))
@@ -288,7 +291,9 @@ class _Test(NamedTuple):
     focal_px: float
 
 
-def _tests(folder: Path | None, out: Path, progress: Progress | None) -> dict[str, list[_Test]]:
+def _read_tests(
+    folder: Path | None, out: Path, progress: Progress | None
+) -> dict[str, list[_Test]]:
     """Return name of the test -> its keys; their truth is made once and kept."""
     tests: dict[str, list[_Test]] = {}
     chosen = [(name, key) for name, keys in TESTS.items() for key in keys]

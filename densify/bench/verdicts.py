@@ -28,10 +28,12 @@ Curve = Mapping[str, Any]
 
 
 def curve(num_true: int, confidence: Float | Float32, outliers: Bool) -> Curve:
-    """Return the curve of outliers over coverage of a map with ``num_true`` true depths.
+    """Return the curve of a map's outliers over its coverage.
 
-    ``confidence`` and ``outliers`` are (K,), of those pixels that also have a depth. Pixels of
-    equal confidence share their outliers evenly.
+    Pixels of equal confidence share their outliers evenly.
+
+    ``num_true`` counts the pixels with a true depth. ``confidence`` and ``outliers`` (K,) are of
+    those among them that also have a depth in the map.
     """
     _, rank, size = np.unique(-confidence, return_inverse=True, return_counts=True)
     outliers_of_rank = np.bincount(rank, outliers, len(size))
@@ -47,16 +49,16 @@ def coverage(outliers: Curve) -> float:
 
 
 def outliers_at(outliers: Curve, covered_percent: float) -> float:
-    """Return the share of outliers, percent, among the most certain pixels of this coverage."""
-    num = covered_percent / 100 * outliers["num"]
+    """Return the percentage of outliers among the most certain pixels, up to this coverage."""
+    num_kept = covered_percent / 100 * outliers["num"]
     steps = np.linspace(0, outliers["covered"], len(outliers["outliers"]))
-    return float(100 * np.interp(num, steps, outliers["outliers"]) / max(num, 1))
+    return float(100 * np.interp(num_kept, steps, outliers["outliers"]) / max(num_kept, 1))
 
 
 def change(figure: str, before: Any, now: Any) -> dict[str, float]:
     """Return the changes of a figure (`Curve`, number or numbers of repeated draws), by name.
 
-    Those of a curve are of its outliers at equal coverage and of its coverage, in percent.
+    A curve has two changes, in percent: of its outliers at equal coverage, and of its coverage.
     """
     if isinstance(before, Mapping):
         covered = min(coverage(before), coverage(now))
@@ -84,8 +86,8 @@ def verdicts(
 ) -> Iterator[Verdict]:
     """Yield the verdict of each figure over all keys that both measurements have.
 
-    Measurements map key -> figure -> value; ``luck`` maps key -> name of a `change` -> its
-    deviation.
+    Both measurements map key -> figure -> value; ``luck`` maps key -> name of a `change` -> its
+    standard deviation.
     """
     # Name of the change -> key -> before, now, change and its standard deviation by luck
     changes: dict[str, dict[str, tuple[float, ...]]] = defaultdict(dict)
@@ -94,7 +96,7 @@ def verdicts(
             old, new = before[key][figure], now[key][figure]
             for name, difference in change(figure, old, new).items():
                 sigma = luck.get(key, {}).get(name, 0.0)
-                if isinstance(old, Sequence):  # draws have luck of their own
+                if isinstance(old, Sequence):  # the spread of repeated draws is their luck
                     sigma = float(np.hypot(np.std(old), np.std(new)) / math.sqrt(2 * len(old)))
                 changes[name][key] = (_plain(name, old), _plain(name, new), difference, sigma)
     for name, change_of_key in changes.items():
@@ -130,14 +132,15 @@ def _verdict(name: str, change_of_key: Mapping[str, tuple[float, ...]]) -> Verdi
 def beyond_luck(
     before: Mapping[str, Any], now: Mapping[str, Any], luck: Mapping[str, float], sigmas: float
 ) -> dict[str, float]:
-    """Return name -> change of those figures of a key that are worse by more than luck explains.
+    """Return the changes, by name, of figures that worsened by more than ``sigmas`` deviations.
 
     Args:
-        before: Figures of the key by name, first measurement; ``now`` has the second.
-        luck: Name of a `change` -> its standard deviation.
+        before: Name of the figure -> value of a key in the first measurement.
+        now: Name of the figure -> value in the second measurement.
+        luck: Name of a `change` -> its standard deviation by luck.
         sigmas: Limit, in standard deviations of the difference of two measurements.
     """
-    worse = {}
+    worse = {}  # the difference of two measurements has √2 times the deviation of one
     for figure in before:
         for name, difference in change(figure, before[figure], now[figure]).items():
             loss = difference if _is_cost(name) else -difference

@@ -99,10 +99,10 @@ class FlowSettings(Section):
         check_engine_spec(self.engine)
 
     def around(self, points_per_s: float) -> tuple[float, float]:
-        """Return two times in seconds: how far around a window motion is searched, and its step.
+        """Return in seconds how far around a window motion is searched, and the step of the search.
 
-        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar: sparse sweeps show
-        little of a moving object, and are searched farther and all of them.
+        A step of 0 means every sweep. ``points_per_s`` is the rate of the lidar. Sparse sweeps show
+        little of a moving object: all of them are searched, and farther.
         """
         is_sparse = points_per_s < _FEW_POINTS_PER_S
         needed_s, step_s = (_AROUND_FEW_S, 0.0) if is_sparse else (_AROUND_S, _AROUND_S)
@@ -198,7 +198,7 @@ _SECTIONS: dict[str, Any] = {f.name: type(f.default) for f in fields(Config)}
 def resolve(
     config: Config | str | Path | Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
 ) -> Config:
-    """Return the settings that ``config`` gives, changed by the overrides.
+    """Return all settings: the defaults, changed by ``config`` and then by the overrides.
 
     Args:
         config: None for the defaults; a Config; a mapping ``{section: {key: value}}``; a Path to a

@@ -43,9 +43,9 @@ class Cache:
     """A folder of cached results of pipeline steps, each in a ``.npz`` file."""
 
     def __init__(self, limit_bytes: int = 10 * 1024**3, folder: Path | None = None) -> None:
-        """Open a folder of entries; if it cannot be made, warn, and keep no results.
+        """Open a folder of entries. If it cannot be made, warn, and keep no results.
 
-        `trim` reduces it to ``limit_bytes``. ``folder`` None is ``steps`` in the user's cache
+        `trim` reduces the folder to ``limit_bytes``. None takes ``steps`` in the user's cache
         folder.
         """
         self._folder = folder or own_folder("steps")
@@ -82,7 +82,9 @@ class Cache:
     def trim(self) -> None:
         """Delete the least recently used entries beyond ``limit_bytes`` or 10,000 files."""
         entries: list[tuple[int, Path, int]] = []
-        for path in self._folder.iterdir() if self._folder.is_dir() else ():
+        if not self._folder.is_dir():
+            return
+        for path in self._folder.iterdir():
             with suppress(OSError):  # another process deletes too
                 status = path.stat()
                 entries.append((status.st_mtime_ns, path, status.st_size))
@@ -139,9 +141,9 @@ def code_digest() -> str:
 def get_cached(
     cache: Cache | None, step: str, inputs: Callable[[], Any], make: Callable[[], T]
 ) -> T:
-    """Return a result by `Cache.get`; without a cache, call ``make`` alone.
+    """Return the cached result of a step, or make it. Without a cache ``make`` alone is called.
 
-    ``inputs`` returns the inputs of `Cache.get`. It is not called without a cache.
+    ``inputs`` returns all that the result depends on, which can take long to collect.
     """
     return make() if cache is None else cache.get(step, inputs(), make)
 

@@ -86,7 +86,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
 
 
 def decode_text(data: bytes, where: Path | str) -> str:
-    """Return UTF-8 bytes as text, no byte order mark; InputError, ``where`` first, for others."""
+    """Return UTF-8 bytes as text without a byte order mark; InputError of ``where`` for others."""
     # Every second byte of plain words in UTF-16 is zero.
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or data[:2].count(0) == 1:
         raise InputError(f"{where}: is text in UTF-16, expected UTF-8; save it as UTF-8")
@@ -144,13 +144,15 @@ def parse_yaml(text: str, where: Path | str) -> tuple[Any, dict[str, int]]:
 
 def _note_lines(node: Any, name: str, lines: dict[str, int]) -> None:
     """Enter the line of each key below a node; raise ValueError for a repeated key."""
-    for key, value in node.value if node.id == "mapping" else ():
-        full = f"{name}.{key.value}" if name else str(key.value)
+    if node.id != "mapping":
+        return
+    for key, value in node.value:
+        dotted_key = f"{name}.{key.value}" if name else str(key.value)
         line = key.start_mark.line + 1
-        if full in lines:
-            raise ValueError(f"line {line}: {full} is given twice; keep one")
-        lines[full] = line
-        _note_lines(value, full, lines)
+        if dotted_key in lines:
+            raise ValueError(f"line {line}: {dotted_key} is given twice; keep one")
+        lines[dotted_key] = line
+        _note_lines(value, dotted_key, lines)
 
 
 def import_extra(module: str, extra: str, needed_by: str) -> Any:

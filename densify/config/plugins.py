@@ -62,7 +62,7 @@ class Table:
         return [*self._rows()]
 
     def require(self, name: str, where: str) -> None:
-        """Raise InputError, starting with ``where``, if no plug-in has this name. Import none."""
+        """Raise InputError, starting with ``where``, if no plug-in has this name; import none."""
         rows = self._rows()
         if name not in rows:
             usages = [getattr(row, "usage", row.name) for row in rows.values()]
@@ -126,7 +126,7 @@ ENGINES = Table(
         Plugin("npz", "densify.readers.flow_files", argument="DIR"),
     ),
 )
-"""Engines. Their modules have the functions of `densify.flow.engines.EngineModule`."""
+"""The scene-flow engines. A module has the functions of `densify.flow.engines.EngineModule`."""
 
 
 def check_engine_spec(spec: str) -> tuple[str, str]:
@@ -228,7 +228,7 @@ READERS = Table(
                "a folder of numbered sweeps (000120.bin, .pcd, .ply, .npy, .csv, ...)"),
     ),
 )  # fmt: skip
-"""Readers. Their modules have the function of `densify.readers.ReaderModule`."""
+"""The readers of data sets. A module has the function of `densify.readers.ReaderModule`."""
 
 
 class Form(NamedTuple):

@@ -46,6 +46,6 @@ class Diagnosis:
 
 
 def examine(sequence: LidarSequence, config: Config) -> Diagnosis:
-    """Run all checks on a recording; at most 15 sweeps and about 40 images are read."""
+    """Run all checks on a recording, by at most 15 sweeps and about 40 images, for a diagnosis."""
     sample = Sample.of(sequence, config.register)
     return Diagnosis(sample, tuple(finding for check in CHECKS for finding in check(sample)))

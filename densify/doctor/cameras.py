@@ -93,10 +93,10 @@ def _check_images(sample: Sample, camera: Camera) -> Finding:
 def camera_views(
     sample: Sample, camera: Camera, silhouettes: dict[int, Silhouettes]
 ) -> tuple[list[View], str]:
-    """Return views of a camera, up to the first unreadable image, and its error, "" for none.
+    """Return views of a camera, and the error of the first image that cannot be read, else "".
 
-    At most max(4, 36 / number of cameras) images are read, spread over all spots. The mapping
-    ``silhouettes``, frame -> silhouettes, is extended by missing frames.
+    At most max(4, 36 / number of cameras) images are read, spread over all spots, none after an
+    error. ``silhouettes``, frame -> silhouettes, is extended by the frames that it lacks.
     """
     stamps_ns = sample.sequence.image_stamps_ns(camera.name)
     pairs = _pair_images(sample, stamps_ns)
@@ -131,7 +131,7 @@ def _pair_images(sample: Sample, stamps_ns: Mapping[int, int]) -> list[tuple[Reg
 
 
 def correct_common_mistakes(T_cam_lidar: Float) -> dict[str, Float]:
-    """Return common mistake -> (4,4) pose of the lidar in the camera frame, corrected for it."""
+    """Return name of a common mistake -> ``T_cam_lidar`` (4,4) after its correction."""
     right_forward_axes = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     T_lidar_cam = poses.inverse(T_cam_lidar)
     return {
@@ -196,11 +196,7 @@ def _report_ambiguous(
 
 
 def _report_offset(
-    camera: Camera,
-    fit: Fit,
-    explanations: list[str],
-    num_images: int,
-    values: Mapping[str, float],
+    camera: Camera, fit: Fit, explanations: list[str], num_images: int, values: Mapping[str, float]
 ) -> Finding:
     """Report the rotation between the given and the best calibration."""
     verdict = FINE

@@ -38,7 +38,7 @@ from densify.registration.deskew import (
 from densify.scores.metrics import RecordedError, main_error
 
 _NEAR_M = 25.0  # range of the returns that show the ground, and that are compared for deskewing
-# Returns of the own vehicle
+# Returns of the ego vehicle
 _CELL_M, _CLOSE_M = 0.1, 6.0  # side of a cell in which sweeps agree; reach of the vehicle
 _LEAST_RETURNS, _LEAST_HEIGHT_M, _DRIVING_M_S = 20, 0.4, 1.0
 _WIDEST_M = 2.6  # width of a road vehicle; kerbs and rails stay beside it too, but farther out
@@ -143,7 +143,11 @@ def _describe_scanner(sample: Sample, number: int, model: SensorModel) -> Findin
 
 
 def check_own_vehicle(sample: Sample) -> list[Finding]:
-    """Check for returns of the own vehicle, which keep their lidar-frame position as it drives."""
+    """Check that ``register.min_range_m`` drops all returns of the ego vehicle.
+
+    These returns keep their position in the lidar frame while the vehicle drives. The verdict is
+    SUSPICIOUS if some lie beyond that range, UNKNOWN if the vehicle drives in fewer than two spots.
+    """
     driving_spots = [
         spot
         for spot in sample.registered
@@ -154,37 +158,39 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
         text = f"the vehicle drives in {len(driving_spots)} of the places looked at, two are needed"
         return [Finding("own vehicle", UNKNOWN, text)]
     range_m = np.linalg.norm(_own_returns(driving_spots), axis=1)
-    num = len(range_m)
-    least_m = sample.settings.min_range_m
+    num_returns = len(range_m)
+    min_range_m = sample.settings.min_range_m
     # The farthest 1 % may be chance returns.
-    farthest_m = float(np.percentile(range_m, 99)) if num else 0.0
-    where, verdict = ("beyond", SUSPICIOUS) if farthest_m > least_m else ("all within", FINE)
-    text = f"{num} returns a sweep, at most {farthest_m:.1f} m away, {where} register.min_range_m"
-    text += f" = {least_m:g}"
-    if num < _LEAST_RETURNS:
+    farthest_m = float(np.percentile(range_m, 99)) if num_returns else 0.0
+    where, verdict = ("beyond", SUSPICIOUS) if farthest_m > min_range_m else ("all within", FINE)
+    text = f"{num_returns} returns a sweep, at most {farthest_m:.1f} m away, {where} "
+    text += f"register.min_range_m = {min_range_m:g}"
+    if num_returns < _LEAST_RETURNS:
         verdict, text = FINE, "no returns of it"
     remedy = f"--set register.min_range_m={np.ceil(10 * farthest_m) / 10:.1f}"
-    values = {"farthest_m": farthest_m, "num_returns": num}
+    values = {"farthest_m": farthest_m, "num_returns": num_returns}
     return [Finding("own vehicle", verdict, text, remedy, values)]
 
 
 def _own_returns(spots: list[Spot]) -> Float:
-    """Return (N,3) metres, cells of 0.1 m of one sweep's returns that all end sweeps have too."""
+    """Return the returns (N,3) of the ego vehicle in one sweep, metres, rounded to 0.1 m cells."""
+    # The first and the last sweep of each spot have returns of it in the same cells.
     R_level_lidar = find_upright([spot.sweeps[0] for spot in spots])
-    cells = []  # of each sweep, a cell for each return
+    cells_of_sweep = []  # for each sweep, the cell of each return
     for spot in spots:
         for sweep in _ends(spot):
             candidates = _own_candidates(sweep.points, spot.twist, R_level_lidar)
-            cells.append([*map(tuple, np.floor(candidates / _CELL_M).astype(np.int64))])
-    common = set.intersection(*map(set, cells))
-    own_cells = [cell for cell in cells[0] if cell in common]
+            cells_of_sweep.append([*map(tuple, np.floor(candidates / _CELL_M).astype(np.int64))])
+    common_cells = set.intersection(*map(set, cells_of_sweep))
+    own_cells = [cell for cell in cells_of_sweep[0] if cell in common_cells]
     return (np.array(own_cells).reshape(-1, 3) + 0.5) * _CELL_M  # middles of the cells
 
 
 def _own_candidates(points: Float, twist: Float, R_level_lidar: Float) -> Float:
-    """Return the (K,3) points, without ground, near enough to be of the own vehicle."""
+    """Return the (K,3) points, without ground, near enough to be of the ego vehicle."""
     range_m = np.linalg.norm(points, axis=1)
     close = points[range_m < _CLOSE_M]
+    # Unit vector to the right of the direction of travel, in the lidar's x and y
     right = np.array([twist[4], -twist[3]]) / np.hypot(twist[3], twist[4])
     close = close[np.abs(close[:, :2] @ right) < _WIDEST_M]
     near_levelled = points[range_m < _NEAR_M] @ R_level_lidar.T
@@ -304,7 +310,10 @@ def _check_origin(name: str, points: Float, R: Float, origins_m: tuple[Float, Fl
 
 
 def find_origin(points: Float, start_m: Float) -> Float:
-    """Return the position (3,), metres, near a start where the rings of (N,3) are sharpest."""
+    """Return the position (3,) of the scanner from which the rings of its points are sharpest.
+
+    ``points`` (N,3) and ``start_m`` (3,), where the search begins, have z along the spin axis.
+    """
     # a coarse grid, with a sample of far points
     axes = [
         np.arange(-reach_m, reach_m + 1e-9, step_m)
@@ -416,7 +425,7 @@ HYPOTHESES: Mapping[str, Callable[[Float], Float]] = {
 
 
 def check_poses(sample: Sample) -> list[Finding]:
-    """Compare the poses as given, and corrected for each of `HYPOTHESES`, with odometry."""
+    """Compare the poses as given, and corrected for each common mistake, with odometry."""
     spots = sample.registered
     try:
         T_world_lidar = sample.sequence.T_world_lidar
@@ -462,9 +471,9 @@ def check_poses(sample: Sample) -> list[Finding]:
 
 def _check_clock(sample: Sample, odometry: list[Float]) -> Finding:
     """Measure at which time shift the poses agree best with odometry (4,4) of each spot."""
-    # It is observable only where the vehicle turns or changes its speed.
+    # The shift is observable only where the vehicle turns or changes its speed.
     late_s = np.arange(-_CLOCK_S, _CLOCK_S + 1e-9, _CLOCK_STEP_S)
-    cost = np.zeros(len(late_s))
+    cost = np.zeros(len(late_s))  # sum of squared errors in standard errors, for each shift
     num_used = 0
     for spot, T_first_last in zip(sample.registered, odometry, strict=True):
         first_ns, last_ns = (end.stamp_ns for end in _ends(spot))

@@ -58,7 +58,7 @@ class Finding:
 class Spot:
     """A spot: a few consecutive sweeps at one position in the recording."""
 
-    sweeps: tuple[Sweep, ...]  # raw sweeps, own vehicle included
+    sweeps: tuple[Sweep, ...]  # raw sweeps, ego vehicle included
     trajectory: Trajectory | None  # poses by odometry; None if registration failed
     failure: str = ""  # reason of the failure
 
@@ -110,7 +110,7 @@ class Sample:
 
     @staticmethod
     def of(sequence: LidarSequence, settings: RegisterSettings) -> Sample:
-        """Read and register spots at start, middle and end; InputError if no sweep can be read."""
+        """Read and register spots at start, middle and end; InputError if no sweep is readable."""
         timeline = Timeline.of(sequence)
         unreadable: dict[int, str] = {}
         spots = []
@@ -164,10 +164,10 @@ class Sample:
 
 
 def choose_frames(timeline: Timeline) -> list[list[int]]:
-    """Return the frame numbers of up to 3 spots, each of up to 5 sweeps about 0.1 s apart."""
+    """Return for each of up to 3 spots the frame numbers of up to 5 sweeps about 0.1 s apart."""
     stride = max(1, round(_STEP_S * 1e9 / timeline.period_ns))
     runs = timeline.split_at_holes(timeline.frames)  # without a hole in time
-    # from the first to the last sweep of a spot, both included
+    # Number of sweeps from the first to the last sweep of a spot, both included
     length = min(max(map(len, runs)), stride * (_NUM_SWEEPS - 1) + 1)
     candidates = [
         run[start : start + length : stride]

@@ -66,17 +66,17 @@ def check_sweep_files(sample: Sample) -> list[Finding]:
     sequence = sample.sequence
     sizes = sequence.sweep_bytes() if hasattr(sequence, "sweep_bytes") else {}
     if sizes:
-        usual = float(np.median(list(sizes.values())))
+        usual_bytes = float(np.median(list(sizes.values())))
         empty = [frame for frame, size in sizes.items() if size == 0]
-        short = [frame for frame, size in sizes.items() if 0 < size < _SHORT * usual]
-        text = f"{len(sizes)} sweeps of {usual / 1e6:.2f} MB, none empty or much shorter"
+        short = [frame for frame, size in sizes.items() if 0 < size < _SHORT * usual_bytes]
+        text = f"{len(sizes)} sweeps of {usual_bytes / 1e6:.2f} MB, none empty or much shorter"
         if empty or short:
             text = (
-                f"empty: {format_frames(empty)}; much shorter than the usual {usual / 1e6:.2f} MB: "
-                f"{format_frames(short)}"
+                f"empty: {format_frames(empty)}; much shorter than the usual "
+                f"{usual_bytes / 1e6:.2f} MB: {format_frames(short)}"
             )
         verdict = WRONG if empty else SUSPICIOUS if short else FINE
-        values = {"num_empty": len(empty), "num_short": len(short), "usual_bytes": int(usual)}
+        values = {"num_empty": len(empty), "num_short": len(short), "usual_bytes": int(usual_bytes)}
         findings.append(Finding("files", verdict, text, _FETCH, values))
     return findings
 
@@ -149,7 +149,7 @@ def check_point_times(sample: Sample) -> list[Finding]:
 
 def _check_point_times_of(sample: Sample, lidar: int) -> Finding:
     """Check the firing times of one scanner."""
-    ends_s = []
+    ends_s = []  # of each middle sweep, the first and the last firing time
     for sweep in sample.middles:
         is_of_lidar = sweep.lidar == lidar
         if sweep.offset_ns is not None and is_of_lidar.any():
@@ -211,7 +211,11 @@ def _median_range_m(points: Float) -> float:
 
 
 def check_axes(sample: Sample) -> list[Finding]:
-    """Check that z points up: one level layer, the ground, holds most returns, with few below."""
+    """Check that z points up, by the ground: a level layer that few returns lie below.
+
+    Along the up axis the layer's share of the near returns exceeds an even spread over all heights
+    by at least 8 %.
+    """
     shares = {
         axis: float(np.median([_ground_share(sweep, up) for sweep in sample.middles]))
         for axis, up in _UP.items()
@@ -236,20 +240,19 @@ def check_axes(sample: Sample) -> list[Finding]:
 
 
 def _ground_share(sweep: Sweep, up: Float) -> float:
-    """Return the share of near returns in the fullest layer across ``up`` (3,) with few below."""
-    # The layer must not be above the origin. The share counts in excess of an even spread over all
-    # heights.
+    """Return the excess share of near returns in the fullest layer across ``up`` (3,)."""
+    # Few returns may lie below the layer, which begins below 0.3 m. An even spread is subtracted.
     height_m = sweep.points[np.linalg.norm(sweep.points, axis=1) < _NEAR_M] @ up
     if not len(height_m):
         return 0.0
     low_m, high_m = np.percentile(height_m, [0.5, 99.5])  # without stray returns
     # Bins are half a layer high. A layer is two neighbouring bins, and layers overlap.
-    edges = np.arange(low_m - _LAYER_M, high_m + 2 * _LAYER_M, 0.5 * _LAYER_M)
-    bin_share = np.histogram(height_m, edges)[0] / len(height_m)
+    edges_m = np.arange(low_m - _LAYER_M, high_m + 2 * _LAYER_M, 0.5 * _LAYER_M)
+    bin_share = np.histogram(height_m, edges_m)[0] / len(height_m)
     layer_share = bin_share[:-1] + bin_share[1:]
     share_below = np.cumsum(bin_share)[:-1] - bin_share[:-1]
     even_share = _LAYER_M / max(float(high_m - low_m), _LAYER_M)
-    is_allowed = (share_below < _MOST_BELOW) & (edges[:-2] < _HIGHEST_M)
+    is_allowed = (share_below < _MOST_BELOW) & (edges_m[:-2] < _HIGHEST_M)
     return float(layer_share[is_allowed].max(initial=0.0)) - even_share
 
 
@@ -272,7 +275,8 @@ def check_directions(sample: Sample) -> list[Finding]:
         remedy = "lost packets: record with a larger buffer of the socket, or leave sweeps out"
         return [Finding(name, SUSPICIOUS, text, remedy, {"lost_deg": widest_deg})]
     if sectors[0] is not None and None not in sectors:
-        text = f"no returns from {sectors[0][0]} to {sectors[0][1]} deg of azimuth in any sweep"
+        first_deg, last_deg = sectors[0]
+        text = f"no returns from {first_deg} to {last_deg} deg of azimuth in any sweep"
         remedy = "a blind sector: something covers the scanner, or the sweeps were cropped"
         return [Finding(name, SUSPICIOUS, text, remedy)]
     return [Finding(name, FINE, "returns all around, as far as the scanner sees")]

@@ -34,7 +34,7 @@ def select_rows(container: T, keep: Bool | Int | slice, columns: Sequence[str] =
 
 
 def joined_rows(containers: Iterable[T]) -> T:
-    """Return one dataclass or named tuple, all fields columns, with the rows of all given ones."""
+    """Return one dataclass or named tuple, all fields columns, with the rows of all containers."""
     pieces = list(containers)
     columns = {
         name: np.concatenate([getattr(piece, name) for piece in pieces])
@@ -55,7 +55,7 @@ def _replace_columns(container: Any, columns: Mapping[str, Any]) -> Any:
 
 
 def table(columns: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    """Return an (M,) structured array of (M,) columns, by field name, without padding."""
+    """Return the columns (M,), by name, as the fields of one structured array (M,), unpadded."""
     num_rows = len(next(iter(columns.values())))
     dtype = [(name, column.dtype) for name, column in columns.items()]
     rows = np.empty(num_rows, dtype)

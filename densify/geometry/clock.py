@@ -16,7 +16,7 @@ _BATCH_S = 0.1  # time of a sweep at the usual rate
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """Reference times of W sweeps, at any rate, with gaps; methods use sweep indices 0 to W - 1."""
+    """Reference times of W sweeps, at any rate, with gaps. Methods take indices 0 to W - 1."""
 
     time_ns: Int  # (W,) int64, ascending
 
@@ -39,15 +39,15 @@ class Clock:
 
     def near(self, i: int, j: int, reach_s: float) -> bool:
         """Return True if sweeps i and j are at most ``reach_s`` plus half a period apart."""
-        slack_ns = reach_s * 1e9 + 0.5 * self.period_ns
-        return bool(abs(self.time_ns[i] - self.time_ns[j]) <= slack_ns)
+        reach_ns = reach_s * 1e9 + 0.5 * self.period_ns
+        return bool(abs(self.time_ns[i] - self.time_ns[j]) <= reach_ns)
 
     def num_in(self, duration_s: float) -> int:
         """Return the number of sweep periods in a duration, rounded, at least 1."""
         return max(1, round(duration_s * 1e9 / self.period_ns))
 
     def batches(self) -> tuple[tuple[int, ...], ...]:
-        """Return groups of consecutive sweep indices, each of 0.1 s, or one sweep if slower."""
+        """Return the sweeps' indices in groups of 0.1 s; a slower scanner has one sweep in each."""
         groups: list[list[int]] = []
         for i, time_ns in enumerate(self.time_ns.tolist()):
             since_first_ns = time_ns - self.time_ns[groups[-1][0]] if groups else np.inf
@@ -59,13 +59,13 @@ class Clock:
         return tuple(map(tuple, groups))
 
     def at(self, i: int, later_s: float) -> int | None:
-        """Return the sweep nearest to ``later_s`` after i; None if no sweep is on that side."""
+        """Return the index of the sweep nearest to ``later_s`` after sweep i; None at the end."""
         candidates = range(i + 1, len(self.time_ns)) if later_s > 0 else range(i - 1, -1, -1)
         wanted_ns = self.time_ns[i] + later_s * 1e9
         return min(candidates, key=lambda j: abs(self.time_ns[j] - wanted_ns), default=None)
 
     def nearest(self, j: int, among: Iterable[int]) -> int:
-        """Return the index ``among`` others that is nearest in time to sweep j, or the earlier."""
+        """Return the index in ``among`` that is nearest in time to sweep j, of two the earlier."""
         return min(among, key=lambda k: (abs(self.time_ns[k] - self.time_ns[j]), k))
 
     def from_end_s(self, i: int) -> float:

@@ -143,7 +143,7 @@ class Kernel:
     def over_rows(self, num_rows: int, *arguments: Any) -> None:
         """Call ``kernel(begin, end, *arguments)`` on all cores, for ranges that cover all rows.
 
-        The kernel must not call `over_rows`. Its result for a row must depend on that row alone.
+        The kernel must not call `over_rows`. The result for a row must depend on that row alone.
         """
         num_parts = min(num_threads(), num_rows // _LEAST_ROWS)
         if num_parts <= 1:

@@ -15,14 +15,14 @@ from densify.geometry.compiled import Kernel, inlined
 
 
 def tree_of(points: Float) -> cKDTree:
-    """Return the k-d tree of (M,d) points, optimised for fast construction and few queries."""
+    """Return the k-d tree of points (M,d), optimised for fast construction and few queries."""
     return cKDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Float, Int]:
-    """Return (N,) distances from queries (N,d) to the nearest points of the tree, and their rows.
+    """Return distances (N,) from queries (N,d) to the nearest points of the tree, and their rows.
 
-    They are inf and -1 for a query without a point closer than ``within_m``.
+    A query without a point closer than ``within_m`` has the distance inf and the row -1.
     """
     distance_m, tree_row = tree.query(queries, distance_upper_bound=within_m)
     row = np.asarray(tree_row, np.int64)
@@ -31,13 +31,13 @@ def nearest(tree: cKDTree, queries: Float, within_m: float = np.inf) -> tuple[Fl
 
 
 def nearest_k(tree: cKDTree, queries: Float, k: int) -> tuple[Float, Int]:
-    """Return (N,k) ascending distances from queries (N,d) to the k nearest points, and rows."""
+    """Return ascending distances (N,k) from queries (N,d) to the k nearest points, and the rows."""
     distance_m, row = tree.query(queries, np.arange(1, min(k, tree.n) + 1))
     return np.asarray(distance_m), np.asarray(row, np.int64)
 
 
 def is_near(tree: cKDTree, queries: Float, within_m: float) -> Bool:
-    """Return (N,) True for (N,d) queries with a point of the tree closer than ``within_m``."""
+    """Return a mask (N,) of the queries (N,d) with a point of the tree closer than ``within_m``."""
     return np.isfinite(tree.query(queries, distance_upper_bound=within_m)[0])
 
 
@@ -67,9 +67,9 @@ def thinned(points: Float | Float32, order: Int, step: float, max_per_cell: int)
 
 
 def bulk(points: NDArray[Any], cell: float, most_cells: int) -> Bool:
-    """Return (N,) True for the points (N,D) around which a grid fits into memory.
+    """Return a mask of the points around which a grid fits into memory: (N,), True if kept.
 
-    These are all points if the box around them is small enough. Otherwise up to 1 % of them, the
+    All points are kept if the box around them is small enough. Otherwise up to 1 % of them, the
     farthest from their median, are left out, such as a few stray returns. If the box is still too
     large, the points are spread out, and none is left out.
 
@@ -122,20 +122,20 @@ def link(points: Float, distance_m: float) -> tuple[int, Int]:
     num_apart = np.abs(cells[pairs[:, 0]] - cells[pairs[:, 1]]).sum(axis=1)
     nearest_first = pairs[np.argsort(num_apart, kind="stable")]
 
-    # Points in the order of their cells, and the first point of each cell
+    # Points in the order of their cells, and the row at which each cell begins
     order = np.argsort(cell_of_point, kind="stable")
     start = np.searchsorted(cell_of_point[order], np.arange(len(cells) + 1))
     root = np.arange(len(cells))
     _join(np.ascontiguousarray(points[order], float), start, nearest_first, distance_m**2, root)
 
-    _, first, label = np.unique(root[cell_of_point], return_index=True, return_inverse=True)
-    renumbered = np.empty(len(first), np.int64)
-    renumbered[np.argsort(first)] = np.arange(len(first))
-    return len(first), renumbered[label]
+    _, first_point, label = np.unique(root[cell_of_point], return_index=True, return_inverse=True)
+    renumbered = np.empty(len(first_point), np.int64)
+    renumbered[np.argsort(first_point)] = np.arange(len(first_point))
+    return len(first_point), renumbered[label]
 
 
 def close_to_seeds(points: Float, seed: Bool, within_m: float, least_share: float) -> Bool:
-    """Return (N,) True for the points (N,3) closer than ``within_m`` to a dense seed.
+    """Return a mask (N,), True for points closer than ``within_m`` to a dense seed.
 
     Args:
         points: (N,3) positions in metres.

@@ -26,30 +26,30 @@ def inverse(T_a_b: Float) -> Float:
 
 
 def transform(T_a_b: Float, points_b: Float) -> Float:
-    """Return (N,3) points, given in frame b, in frame a."""
+    """Return points (N,3), metres, that are given in frame b, in frame a."""
     points_a = rotate(T_a_b, points_b)
     points_a += T_a_b[:3, 3]
     return points_a
 
 
 def rotate(T_a_b: Float, vectors_b: Float) -> Float:
-    """Return (N,3) vectors, given in frame b, in the axes of frame a."""
+    """Return vectors (N,3) that are given in the axes of frame b, in the axes of frame a."""
     R_b_a = T_a_b[:3, :3].T
     vectors_a = np.empty(vectors_b.shape)
-    for first in range(0, len(vectors_b), _ROWS):
-        rows = slice(first, first + _ROWS)
+    for begin in range(0, len(vectors_b), _ROWS):
+        rows = slice(begin, begin + _ROWS)
         np.matmul(vectors_b[rows], R_b_a, out=vectors_a[rows])
     return vectors_a
 
 
 def log(T_a_b: Float) -> Float:
-    """Return the (...,6) twists of poses (...,4,4): rotation vector (rad), own translation (m)."""
+    """Return the twists (...,6) of poses (...,4,4): rotation vector (rad), own translation (m)."""
     rotation = Rotation.from_matrix(T_a_b[..., :3, :3]).as_rotvec()
     return np.concatenate([rotation, T_a_b[..., :3, 3]], axis=-1)
 
 
 def exp(twist: Float) -> Float:
-    """Return the poses (...,4,4) of twists (...,6) in rad and m; inverts `log`."""
+    """Return the poses (...,4,4) of twists (...,6) in rad and m; the inverse of `log`."""
     T_a_b = np.zeros((*twist.shape[:-1], 4, 4))
     T_a_b[..., :3, :3] = Rotation.from_rotvec(twist[..., :3]).as_matrix()
     T_a_b[..., :3, 3] = twist[..., 3:]
@@ -58,18 +58,18 @@ def exp(twist: Float) -> Float:
 
 
 def twist_between(T_world_a: Float, T_world_b: Float, seconds: float) -> Float:
-    """Return the (6,) velocity (rad/s, m/s) of the motion from pose a to pose b, in frame a."""
+    """Return the velocity (6,), rad/s and m/s in frame a, from pose a to pose b in ``seconds``."""
     return log(inverse(T_world_a) @ T_world_b) / seconds
 
 
 def twist_to(T_world_lidar: Float, stamp_ns: Int, i: int) -> Float:
-    """Return the (6,) velocity (rad/s, m/s) from pose i - 1 to i, in the frame of pose i - 1."""
+    """Return the velocity (6,), rad/s and m/s, from pose i - 1 of (n,4,4) to i, in frame i - 1."""
     seconds = (stamp_ns[i] - stamp_ns[i - 1]) * 1e-9
     return twist_between(T_world_lidar[i - 1], T_world_lidar[i], seconds)
 
 
 def transform_twist(T_a_b: Float, twist_b: Float) -> Float:
-    """Return twists (...,6) of frame b in frame a of the same rigid body, by the adjoint."""
+    """Return in frame a the twists (...,6) of a rigid body that are given in frame b (adjoint)."""
     R_a_b = T_a_b[..., :3, :3]
     rotation = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., :3])
     translation = np.einsum("...ij,...j->...i", R_a_b, twist_b[..., 3:])
@@ -78,12 +78,12 @@ def transform_twist(T_a_b: Float, twist_b: Float) -> Float:
 
 
 def interpolate(T_world_a: Float, T_world_b: Float, fraction: float) -> Float:
-    """Return the (4,4) pose between a (fraction 0) and b (fraction 1), or beyond."""
+    """Return the pose (4,4) between pose a (fraction 0) and pose b (fraction 1), or beyond."""
     return T_world_a @ exp(fraction * log(inverse(T_world_a) @ T_world_b))
 
 
 def fit_rigid(source: Float, target: Float) -> Float:
-    """Return the (4,4) rigid motion that maps source (N,3) to target points in least squares.
+    """Return the rigid motion (4,4) that maps source (N,3) to target points (N,3) in least squares.
 
     A rotation that the points do not determine is zero (Kabsch 1976).
     """

@@ -13,11 +13,11 @@ from densify.geometry.compiled import Kernel
 def move_with_twists(
     points: Float, seconds: NDArray[np.floating], twist_before: Float, twist_after: Float
 ) -> Float:
-    """Return the (N,3) points, each moved by ``exp(seconds * twist)``.
+    """Return the points (N,3), metres, each moved by ``exp(seconds * twist)`` for its own time.
 
     Args:
         points: (N,3) metres.
-        seconds: (N,) time for which each point moves, may be negative.
+        seconds: (N,) time for which each point moves, negative for a motion backwards.
         twist_before: (6,) velocity (rad/s, m/s) of points with negative seconds.
         twist_after: (6,) velocity of the other points.
     """
@@ -40,6 +40,7 @@ def move_with_twists(
 @Kernel
 def _move(begin, end, points, seconds, axes, speed_rad_s, velocity_m_s, moved):  # type: ignore[no-untyped-def]
     """Fill ``moved`` (N,3) by the formula of Rodrigues, with one axis (2,3) for each sign."""
+    # p' = p + sin(wt) a×p + (1 - cos(wt)) a×(a×p) + t v, with axis a, angular speed w, velocity v
     for i in range(begin, end):
         t = seconds[i]
         w = 0 if t < 0 else 1

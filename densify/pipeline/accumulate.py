@@ -33,9 +33,9 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
     """
     used_rows = [np.flatnonzero(~(drop_lost & flow.lost)) for flow in fields]
     cloud = _empty_cloud(sum(map(len, used_rows)))
-    first = 0  # first row of the sweep in the cloud
+    begin_row = 0  # row of the cloud at which the sweep's points begin
     for registered, flow, rows in zip(stretch.sweeps, fields, used_rows, strict=True):
-        span = slice(first, first + len(rows))
+        span = slice(begin_row, begin_row + len(rows))
         sweep = registered.sweep
         T_key_lidar = stretch.T_target_source(key, registered.frame)
         cloud.rigid_points[span] = poses.transform(T_key_lidar, sweep.points).take(rows, axis=0)
@@ -48,35 +48,35 @@ def accumulate(stretch: Stretch, fields: Sequence[FlowField], key: int, drop_los
         cloud.moving[span] = flow.moving[rows]
         cloud.instance[span] = flow.instance[rows]
 
-        # Moving points that are followed to the key sweep go where their flow leads.
+        # Only moving points that are followed to the key sweep are displaced by their flow.
         followed = np.flatnonzero((flow.moving & ~flow.lost)[rows])
-        cloud_rows = first + followed
+        cloud_rows = begin_row + followed
         flow_rows = rows[followed]
         cloud.points[cloud_rows] += poses.rotate(T_key_lidar, flow.total[flow_rows])
         if flow.velocity_m_s is not None:
             velocity_m_s = poses.rotate(T_key_lidar, flow.velocity_m_s[flow_rows])
             cloud.velocity_m_s[cloud_rows] = velocity_m_s
-        first = span.stop
+        begin_row = span.stop
     cloud.confidence[:] = confidence_by_age(cloud.since_key_ns)
     return cloud
 
 
-def _empty_cloud(num: int) -> Cloud:
-    """Return a cloud of ``num`` points of the window, to be filled in."""
+def _empty_cloud(num_points: int) -> Cloud:
+    """Return a cloud of the window whose ``num_points`` points are still to be filled in."""
     return Cloud(
-        points=np.empty((num, 3)),
-        rigid_points=np.empty((num, 3)),
-        frame=np.empty(num, np.int32),
-        since_key_ns=np.empty(num, np.int64),
-        row=np.empty(num, np.int64),
-        lidar=np.empty(num, np.uint8),
-        moving=np.empty(num, bool),
-        instance=np.empty(num, np.int32),
-        velocity_m_s=np.zeros((num, 3), np.float32),
-        confidence=np.empty(num, np.float32),
-        intensity=np.empty(num, np.float32),
-        rgb=np.zeros((num, 3), np.uint8),
-        far=np.zeros(num, bool),
+        points=np.empty((num_points, 3)),
+        rigid_points=np.empty((num_points, 3)),
+        frame=np.empty(num_points, np.int32),
+        since_key_ns=np.empty(num_points, np.int64),
+        row=np.empty(num_points, np.int64),
+        lidar=np.empty(num_points, np.uint8),
+        moving=np.empty(num_points, bool),
+        instance=np.empty(num_points, np.int32),
+        velocity_m_s=np.zeros((num_points, 3), np.float32),
+        confidence=np.empty(num_points, np.float32),
+        intensity=np.empty(num_points, np.float32),
+        rgb=np.zeros((num_points, 3), np.uint8),
+        far=np.zeros(num_points, bool),
     )
 
 
@@ -93,10 +93,10 @@ def object_tracks(
 ) -> tuple[ObjectTrack, ...]:
     """Return the track of each moving object, ordered by instance number.
 
-    A pose is the rigid motion that best fits ``fields``, each sweep's flow to the key sweep, at
-    three or more points of the object. An object needs one pose. Its x axis is along its velocity,
-    or along its path over the window if that is longer, for objects of 3 m and more at the rear
-    axle.
+    A pose is the rigid motion that best fits the flow at three or more points of the object in one
+    sweep. Objects without a pose are left out. The x axis of an object is along its velocity, or
+    along its path over the window if the path is longer. Objects of 3 m and more head along the
+    motion of their rear axle. ``fields`` are each sweep's flow to the key sweep.
     """
     objects = _collect_objects(stretch, fields, key)
     stamps_ns = {registered.frame: registered.sweep.stamp_ns for registered in stretch.sweeps}
@@ -139,24 +139,26 @@ def _fit_track(
     instance: int, by_frame: dict[int, _ObjectPoints], key: int, stamps_ns: dict[int, int]
 ) -> ObjectTrack:
     """Return the track of an object from its points and the sweeps' reference times by frame."""
-    # Motion of the object from the key to each sweep, in the key sweep's lidar frame.
-    T_sweep_key = {
+    # Motion of the object from the key's time to each sweep's time, within the key frame
+    motion_from_key = {
         frame: poses.fit_rigid(points.at_key, points.at_sweep)
         for frame, points in by_frame.items()
         if len(points.at_sweep) >= _LEAST_POINTS
     }
-    T_sweep_key[key] = np.eye(4)
-    frames = sorted(T_sweep_key)
-    duration_s = (stamps_ns[frames[-1]] - stamps_ns[frames[0]]) * 1e-9
-    velocity_m_s = np.median([points.velocity_m_s for points in by_frame.values()], axis=0)
-    points_key = np.concatenate([points.at_key for points in by_frame.values()])
-    T_box, size_m = _fit_box(
-        points_key, velocity_m_s, T_sweep_key[frames[0]], T_sweep_key[frames[-1]], duration_s
+    motion_from_key[key] = np.eye(4)
+    frames = sorted(motion_from_key)
+    stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
+    median_velocity_m_s = np.median([points.velocity_m_s for points in by_frame.values()], axis=0)
+    T_key_box, size_m = _fit_box(
+        points=np.concatenate([points.at_key for points in by_frame.values()]),
+        velocity_m_s=median_velocity_m_s,
+        to_first=motion_from_key[frames[0]],
+        to_last=motion_from_key[frames[-1]],
+        duration_s=int(stamp_ns[-1] - stamp_ns[0]) * 1e-9,
     )
 
-    T_key_object = np.stack([T_sweep_key[frame] @ T_box for frame in frames])
-    stamp_ns = np.array([stamps_ns[frame] for frame in frames], np.int64)
-    velocities_m_s = velocity_m_s[None]
+    T_key_object = np.stack([motion_from_key[frame] @ T_key_box for frame in frames])
+    velocities_m_s = median_velocity_m_s[None]
     if len(frames) > 1:
         since_key_s = (stamp_ns - stamps_ns[key]) * 1e-9
         velocities_m_s = np.gradient(T_key_object[:, :3, 3], since_key_s, axis=0)
@@ -174,19 +176,19 @@ def _fit_track(
 
 
 def _fit_box(
-    points: Float, velocity_m_s: Float, T_first_key: Float, T_last_key: Float, duration_s: float
+    points: Float, velocity_m_s: Float, to_first: Float, to_last: Float, duration_s: float
 ) -> tuple[Float, Float]:
-    """Return pose (4,4) and size (3,) of the box around points (N,3) with x along the motion.
+    """Return pose (4,4) and size (3,) in metres of the box around points (N,3), x along the motion.
 
-    All are in metres and in the key frame, as the motions (4,4) of the object from the key to its
-    first and last sweep.
+    All are in the key frame. ``to_first`` and ``to_last`` (4,4) are the object's motions from the
+    key's time to those of its first and last sweep, ``duration_s`` is the time between the latter.
     """
     # Direction of the median point: its displacement by velocity or by pose, the longer one
     reference = np.median(points, axis=0)
-    begin, end = (poses.transform(T, reference[None])[0] for T in (T_first_key, T_last_key))
+    begin, end = (poses.transform(motion, reference[None])[0] for motion in (to_first, to_last))
     by_velocity = velocity_m_s * duration_s if duration_s else velocity_m_s
     direction = max(by_velocity, end - begin, key=lambda xyz: float(np.hypot(*xyz[:2])))
-    yaw_first, yaw_last = (poses.log(T)[2] for T in (T_first_key, T_last_key))
+    yaw_first, yaw_last = (poses.log(motion)[2] for motion in (to_first, to_last))
     # A vehicle heads where its rear axle moves. The first iteration finds the axle.
     for _ in range(2):
         heading = np.arctan2(direction[1], direction[0])

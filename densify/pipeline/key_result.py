@@ -72,7 +72,7 @@ def methods_of_run(method: str, settings: Config) -> tuple[str, ...]:
 
 
 def looks_around(methods: Sequence[str]) -> bool:
-    """Return True if a named method estimates scene flow, which also searches around the window."""
+    """Return True if one of the named methods searches motion around the window (scene flow)."""
     return any(METHODS[name].engine is not None for name in methods if name in METHODS)
 
 
@@ -100,8 +100,7 @@ def result_of_method(
     """Return the result of the method ``name``, without its baselines.
 
     Args:
-        moments: Points at the key's time by method. Those of this method are taken out to save
-            memory.
+        moments: Method -> points at the key's time. This method's entry is removed, to save memory.
         filled: Fill holes of the maps by interpolation.
     """
     method, output = METHODS[name], scene.settings.output
@@ -156,7 +155,7 @@ def result_of_method(
 
 
 def see(scene: KeyScene, name: str, cloud: Cloud) -> SeenCloud:
-    """Return the accumulated points of the method ``name`` as the cameras see them."""
+    """Return the points of the method ``name``, accumulated and far, as the cameras see them."""
     visible = METHODS[name].visible and scene.settings.project.visibility
     return _see_window(scene, cloud, visible).with_far_points(_see_far(scene, METHODS[name]))
 
@@ -196,9 +195,10 @@ def _make_maps(
         if visible and is_alone:
             depth_map = without_confirmation(depth_map)
         elif untimed_share:
-            # Without a time a point is shifted by up to the motion in half a period: forwards,
-            # twist[5].
-            shift_m = 0.5 * period_s * abs(float(exposure.twist[5]))
+            # Without a time, a point is off by up to the motion in half a period. Along the
+            # camera's z axis that is component 5 of the twist.
+            forward_m_s = float(exposure.twist[5])
+            shift_m = 0.5 * period_s * abs(forward_m_s)
             depth_map = without_times(depth_map, shift_m, exposure.camera, untimed_share)
         depth_map = with_max_outliers(depth_map, scene.settings.project.max_outliers)
         depth_maps[name] = with_ages(depth_map, stamps_ns, scene.key, exposure.late_s)
@@ -225,16 +225,13 @@ def _score(
     visible: bool,
     held_out: dict[str, Any] | None,
 ) -> dict[str, Any]:
-    """Return the scores, those of depth if there is ground truth; ``held_out`` are known."""
+    """Return all scores of a method, of which ``held_out`` are given and depth needs truth."""
     metrics: dict[str, Any] = {
         "num_points": len(cloud),
         "num_moving": int(cloud.moving.sum()),
         "density": {
-            name: {
-                "measured": image_density(depth_map.depth_m),
-                "filled": image_density(depth_map.filled_m),
-            }
-            for name, depth_map in depth_maps.items()
+            name: {"measured": image_density(maps.depth_m), "filled": image_density(maps.filled_m)}
+            for name, maps in depth_maps.items()
         },
         "ghosts": ghost_scores(cloud, scene.key_image, scene.key),
     }
@@ -262,10 +259,10 @@ def _score(
 def complete_with_prior(
     scene: KeyScene, result: Result, files: PriorFiles, shots: Mapping[str, Shot]
 ) -> Result:
-    """Return the result with completed maps (``full``) and their scores.
+    """Return the result with maps that depth images complete (``full``), and their scores.
 
     A prior that does not fit the measured depth is not used, and a warning is logged. ``shots`` are
-    by map name. Raise InputError if the prior has no depth image for any map of the key.
+    by map name. Raise InputError if ``files`` has no depth image for any map of the key.
     """
     full = {}
     metrics = copy.deepcopy(dict(result.metrics))

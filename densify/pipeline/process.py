@@ -23,10 +23,10 @@ _PER_MB = 1024 * 1024 if sys.platform == "darwin" else 1024  # units of getrusag
 
 
 class Watch:
-    """Measure wall time and memory of stages, summed over threads, without inner stages."""
+    """Measure each stage's wall time, without inner stages and summed over threads, and memory."""
 
     def __init__(self, progress: Progress | None = None) -> None:
-        """Begin to measure; ``progress`` is called by one thread at a time."""
+        """Begin to measure. One thread at a time calls ``progress`` (stage, done, total)."""
         self._progress = progress
         self._seconds: dict[str, float] = {}
         self._peak_mb: dict[str, float] = {}
@@ -39,14 +39,14 @@ class Watch:
     def stage(self, name: str, is_part: bool = False) -> Iterator[None]:
         """Measure the work inside the ``with`` block as the stage of this name.
 
-        Report its begin and its end, unless it is a part that `each` counts. After its end, report
-        the stage that still runs in this or another thread.
+        Report its begin and its end, and then the stage that still runs in any thread. ``is_part``
+        marks a part that `each` counts, and reports nothing.
         """
         if not is_part:
             self._running.append(name)
             self.report(name, 0, 1)
         begin_s = time.perf_counter()
-        # Time of the stages that the outer stage has called before this one
+        # Time of the stages that the outer stage has called before; the counter is this stage's now
         siblings_s = getattr(self._thread, "inner_s", 0.0)
         self._thread.inner_s = 0.0
         try:
@@ -83,7 +83,10 @@ class Watch:
         return time.perf_counter() - self._begin_s
 
     def costs(self) -> tuple[StageCost, ...]:
-        """Return the cost of each stage measured until now, repeated runs of a stage added up."""
+        """Return the costs of the stages since the begin or the last `restart`.
+
+        Repeated runs add up. The memory is the process's peak at the end of the stage's last run.
+        """
         from densify.geometry.types import StageCost  # the command line starts without numpy
 
         return tuple(

@@ -99,11 +99,11 @@ class FarSurfaces(NamedTuple):
     """The static surfaces beyond a key's window."""
 
     world: StaticWorld
-    T_key_world: Float  # (4,4) pose of that world in the key frame
+    T_key_world: Float  # (4,4) pose of that world in the key sweep's lidar frame
 
 
 class Recording:
-    """A sequence with its settings; computes pipeline steps and keeps recent results in memory."""
+    """A sequence with its settings. It computes pipeline steps and keeps the latest in memory."""
 
     def __init__(
         self,
@@ -140,8 +140,9 @@ class Recording:
 
         keys = timeline.frames if keys is None else keys
         Cut.of(timeline, window, keys)  # raises for a bad key or window before a sweep is read
-        looks_around &= engine_row(settings.flow.engine)[0].shared
-        around_s, step_s = self._look_around(keys if looks_around else ())
+        plugin, _ = engine_row(settings.flow.engine)
+        looks_around &= plugin.shared
+        around_s, step_s = self._look_around(keys) if looks_around else (0.0, 0.0)
         self.cut = Cut.of(timeline, window, keys, around_s)
         # Around the windows motion is searched in every n-th sweep.
         self._step_around = max(1, timeline.num_in(step_s))
@@ -155,8 +156,10 @@ class Recording:
 
     def _look_around(self, keys: Collection[int]) -> tuple[float, float]:
         """Return the seconds around windows where motion is searched, and between its sweeps."""
+        if self.settings.flow.look_around_s == 0:
+            return 0.0, 0.0
         # The first readable key shows the number of points per second.
-        for key in sorted(keys) if self.settings.flow.look_around_s != 0 else ():
+        for key in sorted(keys):
             with suppress(InputError):  # raised again where the key is made
                 num_points = len(self.sequence[key])
                 return self.settings.flow.around(num_points / (self.timeline.period_ns * 1e-9))
@@ -189,12 +192,18 @@ class Recording:
         return WindowFrames(frames, usable.cuts)
 
     def window(self, key: int) -> Stretch:
-        """Return the registered, deskewed sweeps of a key's window; raise as `window_frames`."""
+        """Return the registered, deskewed sweeps of a key's window.
+
+        Raise SweepError if the key cannot be registered, InputError if it cannot be read.
+        """
         frames = self.window_frames(key).frames  # raises before a piece is looked up
         return self._stretch(self._piece(key), frames)
 
-    def searched(self, key: int) -> Stretch:
-        """Return the sweeps of a key's piece in which motion is searched, as `window`."""
+    def searched_stretch(self, key: int) -> Stretch:
+        """Return the registered, deskewed sweeps of a key's piece in which motion is searched.
+
+        These are all sweeps of windows, and every n-th sweep around. The key must be registered.
+        """
         piece = self._piece(key)
         return self._stretch(piece, self._searched_frames(piece))
 
@@ -203,14 +212,19 @@ class Recording:
         return len(self._searched_frames(self._piece(key))) == 2
 
     def motion(self, key: int, engine: str | None = None) -> Motion:
-        """Return the scene flow of all points in a key's window; engine None or "": configured."""
+        """Return the scene flow of all points in a key's window.
+
+        ``engine`` is ``NAME[:ARGUMENT]``; None or "" takes the configured one. Raise SweepError or
+        InputError if the key or the engine cannot be used.
+        """
         engine = engine or self.settings.flow.engine
         window = self.window(key)
         piece = self._piece(key)
         # The engine ``groups`` tracks objects, which takes three sweeps.
         if engine == "groups" and self.is_pair(key):
             engine = "pairs"
-        if not engine_row(engine)[0].shared:
+        plugin, _ = engine_row(engine)
+        if not plugin.shared:  # the motion serves this window alone, and is not kept
             return estimate_motion(Scene(window, self._ground(piece)), self.settings, engine)
         # The poses of all searched sweeps, but points only for those of the window
         in_window = {registered.frame: registered for registered in window.sweeps}
@@ -221,7 +235,7 @@ class Recording:
         return self._motion(piece, engine).with_stretch(Stretch(tuple(sweeps)))
 
     def step(self, frame: int) -> StretchFlow:
-        """Return the flow of a sweep to the next of its window, else to the first, else none."""
+        """Return a sweep's flow to the next sweep of its window, at its end to the first sweep."""
         window = self.window(frame)
         later = [other for other in window.frames if other > frame]
         earlier = [other for other in window.frames if other < frame]
@@ -255,7 +269,7 @@ class Recording:
         with self._watch.stage("accumulate"):
             drop_lost = self.settings.accumulate.unfollowed == "drop"
             cloud = accumulate(used, fields, key, drop_lost)
-            del fields  # as large as the cloud
+            del fields  # frees memory: they are as large as the cloud
             heights = self._ground(self._piece(key))
             tracks = complete_boxes(tracks, cloud, Rays(used, key), heights)
             is_below = heights.below(cloud.rigid_points, stretch[key].T_world_lidar)
@@ -272,7 +286,7 @@ class Recording:
         return float(np.concatenate(is_below).mean())
 
     def find_far_surfaces(self, key: int) -> FarSurfaces | None:
-        """Return the static surfaces beyond the key's window; None without ``far_m`` or sweeps."""
+        """Return the static surfaces beyond a key's window; None if ``far_m`` is 0 or none is."""
         if not self.settings.accumulate.far_m:
             return None
         piece = self._piece(key)
@@ -365,13 +379,13 @@ class Recording:
 
     @_latest
     def _searched_frames(self, piece: Piece) -> tuple[int, ...]:
-        """Return the frames of a piece where motion is searched: windows, and every n-th around."""
+        """Return the frames of a piece whose motion is searched: windows, and every n-th beside."""
         frames = piece.frames
         in_windows = self._in_windows(piece.number)
         window_rows = np.flatnonzero([frame in in_windows for frame in frames])
         if self._step_around == 1 or not len(window_rows):
             return frames
-        # Number of sweeps to the nearest window, 0 within it
+        # Number of sweeps to the nearest window, 0 within a window
         num_away = np.abs(np.arange(len(frames))[:, None] - window_rows).min(axis=1)
         is_searched = num_away % self._step_around == 0
         return tuple(np.array(frames)[is_searched].tolist())
@@ -430,11 +444,7 @@ class Recording:
         return frozenset(frame for frames in windows for frame in frames)
 
     def _cached(
-        self,
-        step: str,
-        frames: Iterable[int],
-        make: Callable[[], T],
-        settings: Sequence[Any] = (),
+        self, step: str, frames: Iterable[int], make: Callable[[], T], settings: Sequence[Any] = ()
     ) -> T:
         """Return the result of ``make``, or the cached result for the same sweeps and settings."""
 

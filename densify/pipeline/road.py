@@ -18,14 +18,7 @@ from densify.depth import far
 from densify.free_space.sensor import Sensors
 from densify.geometry import poses
 from densify.geometry.compiled import num_threads
-from densify.geometry.types import (
-    Camera,
-    Float,
-    RegisteredSweep,
-    StaticWorld,
-    Stretch,
-    Trajectory,
-)
+from densify.geometry.types import Camera, Float, RegisteredSweep, StaticWorld, Stretch, Trajectory
 from densify.pipeline.sweeps import Sweeps
 from densify.readers.timeline import Timeline
 from densify.registration.deskew import deskew_sweep, twists
@@ -36,9 +29,8 @@ _STEP_M = 2.0  # usual distance along the road between the sweeps that are used
 _MIN_STEP_M = 0.5 * _STEP_M  # least distance between them: sweeps do not lie at exact steps
 _MAX_S = 15.0  # greatest time on each side; a parked vehicle observes nothing new
 _SAME_VIEW_M = 3.0  # distance between keys up to which they share a view
-_UNSEEN_SHARE = (
-    0.5  # of ``far_m``, used where no camera looks: farther sweeps measure little in view
-)
+# Share of ``far_m`` that is used where no camera looks: farther sweeps measure little in view
+_UNSEEN_SHARE = 0.5
 # Greatest distance of a camera from its pose in the test of the view: the motion of a fast vehicle
 # within a sweep and until the exposure
 _SLACK_M = 4.0
@@ -86,7 +78,7 @@ class Road:
         """
         # Collect and register the sweeps, in the order of the road.
         window_sweeps = self._thin_window()
-        numbers = count(1)  # of the sweeps of both sides, for the progress
+        numbers = count(1)  # running number of the sweeps of both sides, for the progress
         with ThreadPoolExecutor(num_threads()) as pool:
             sweeps_before, sweeps_after = pool.map(partial(self._collect_side, numbers), (-1, 1))
         road_sweeps = [*sweeps_before[::-1], *window_sweeps, *sweeps_after]
@@ -144,11 +136,11 @@ class Road:
         end_of_window = self.window.sweeps[0 if side < 0 else -1]
         end_travel_m = 0.0 if side < 0 else self._travel_m[-1]
         reach_m = self.far_m if self._may_see_end(side) else _UNSEEN_SHARE * self.far_m
-        max_sweeps = round(2 * self.far_m / _STEP_M)  # on both sides
+        num_expected = round(2 * self.far_m / _STEP_M)  # sweeps of both sides
         road_sweeps = list[_RoadSweep]()
         last_position = end_of_window.T_world_lidar[:3, 3]
         from_window_m = 0.0  # travel from the end of the window to the sweep
-        last_used_m = 0.0  # the same of the last sweep that is used
+        last_used_m = 0.0  # travel from the end of the window to the last sweep that is used
         for registered, surface in self._register_side(side, reach_m):
             position = registered.T_world_lidar[:3, 3]
             from_window_m += float(np.linalg.norm(position - last_position))
@@ -160,7 +152,7 @@ class Road:
             travel_m = end_travel_m + side * from_window_m
             road_sweeps.append(_RoadSweep(in_view, surface, travel_m, in_window=False))
             number = next(numbers)
-            self.sweeps.watch.report("far", number, max(number, max_sweeps))
+            self.sweeps.watch.report("far", number, max(number, num_expected))
         return road_sweeps
 
     def _may_see_end(self, side: int) -> bool:
@@ -192,22 +184,22 @@ class Road:
         )
 
     def _max_sweeps(self, reach_m: float) -> int:
-        """Return the number of sweeps after which a side ends even if it is shorter than reach."""
+        """Return the greatest number of sweeps of one side, whatever travel they cover."""
         first, last = self.window.sweeps[0], self.window.sweeps[-1]
         max_s = _MAX_S
         duration_ns = last.sweep.stamp_ns - first.sweep.stamp_ns
         if duration_ns > 0:
             travel = last.T_world_lidar[:3, 3] - first.T_world_lidar[:3, 3]
             speed_m_s = float(np.linalg.norm(travel)) / (1e-9 * duration_ns)
-            # Outside the window the vehicle may be half as fast.
+            # Outside the window the vehicle may be half as fast. At rest, _MAX_S is the limit.
             max_s = min(max_s, 2 * reach_m / max(speed_m_s, 1e-3))
         return int(max_s * 1e9 / self.timeline.period_ns)
 
     def _follow_recorded(
         self, end_of_window: RegisteredSweep, frames: Sequence[int], reach_m: float
     ) -> Iterator[tuple[RegisteredSweep, None]]:
-        """Yield the sweeps of `_register_side` at the recording's own poses."""
-        from_window_m = last_used_m = 0.0  # travel as in `_collect_side`
+        """Yield the raw sweeps of one side up to ``reach_m`` of travel, at their recorded poses."""
+        from_window_m = last_used_m = 0.0  # travel from the window to this and the last used sweep
         T_world_last = end_of_window.T_world_lidar
         last_ns = end_of_window.sweep.stamp_ns
         recorded_pose = cast(Callable[[int], Float], self.sweeps.recorded_pose)
@@ -277,9 +269,9 @@ class Road:
 def choose_views(
     cameras: Collection[Camera], window: Stretch, keys: Sequence[int]
 ) -> list[tuple[Camera, Float]]:
-    """Return the views of ascending keys: each camera with its pose ``T_cam_world`` (4,4).
+    """Return the views of some keys: each camera with its pose ``T_cam_world`` (4,4).
 
-    A key at most 3 m from the last key with a view of its own shares that view.
+    ``keys`` ascend. A key at most 3 m from the last key with a view of its own shares that view.
     """
     key_poses: list[Float] = []
     for T_world_lidar in (window[key].T_world_lidar for key in keys):

@@ -52,22 +52,28 @@ def run(
     progress: Progress | None = None,
     prior: str | Path | None = None,
 ) -> Result:
-    """Densify one key.
+    """Densify the sweeps around one key sweep, and return its cloud, depth maps and scores.
 
     Args:
+        sequence: The recording, from `densify.open_sequence`.
         key: Frame number of the key sweep.
         window: Number of sweeps on each side of the key. The window is cut, with a warning, at the
             ends of the recording, at a hole in time of more than three usual periods, and at a
             sweep that cannot be used.
         method: ``flow`` (scene flow), ``icp`` (rigid accumulation) or ``none`` (single sweep).
         cameras: Names of cameras; None for all.
-        config: Settings, see `densify.config.resolve`.
+        config: Settings: None for the defaults, a `Config`, a mapping ``{section: {key: value}}``,
+            the name of a preset, or the path of a YAML file.
         progress: Callback (stage, done, total).
         prior: Folder of depth images that complete the pixels without measured or filled depth.
 
     Returns:
         The result. With ``output.score`` it also has the simpler methods as ``baselines``, and
             scores of maps made without the key sweep.
+
+    Raises:
+        InputError: An argument or a setting is invalid, or the key sweep cannot be read.
+        ComputationError: The key sweep or all its neighbours cannot be registered.
     """
     results = run_keys(sequence, [key], window, method, cameras, config, progress, prior=prior)
     ((_, result),) = results  # the pair of the only key
@@ -90,7 +96,12 @@ def run_keys(
     """Densify several keys, and yield (key, result or error) by ascending key.
 
     Keys whose windows overlap share registration, ground and motion. Objects are tracked over all
-    these sweeps, which can improve a key slightly over `run`, whose arguments apply.
+    these sweeps, which can improve a key slightly over `run`. Arguments that are not listed are
+    those of `run`.
+
+    Args:
+        keys: Frame numbers of the key sweeps, in any order.
+        cache: Keeps registration, motion and far surfaces on disk.
     """
     methods = methods_of_run(method, resolve(config))
     watch = Watch(progress)
@@ -116,12 +127,12 @@ def compare(
 ) -> dict[str, Result]:
     """Densify one key with several methods on the same registration, and score them.
 
-    The arguments are as in `run`, except for these.
+    Arguments that are not listed are those of `run`.
 
     Args:
         methods: Some of ``none``, ``icp``, ``icp-visible``, ``icp-far``, ``flow-plain``, ``paper``
             and ``flow``.
-        cache: Keeps the results of steps on disk.
+        cache: Keeps registration, motion and far surfaces on disk.
         prior: Folder of depth images that complete the maps of the last method.
 
     Returns:
@@ -143,8 +154,8 @@ def flow_steps(
 ) -> Iterator[tuple[int, StretchFlow | ComputationError | InputError]]:
     """Yield (frame, scene flow to the next sweep, or error) for sweeps of a whole recording.
 
-    Without a next sweep, at the end or a hole in time, it is to the previous one. ``frames``
-    ascend.
+    At the end of the recording and before a hole in time, the flow is to the previous sweep.
+    ``frames`` ascend. ``cache`` keeps registration and motion on disk.
     """
     recording = _open(sequence, frames, 1, ["flow"], None, config, cache, None)
 
@@ -193,20 +204,22 @@ def densify(
     with ThreadPoolExecutor(num_threads()) as pool:
         # Accumulate the window, rigidly or with flow. Meanwhile find static surfaces beyond it.
         wants_far = any(METHODS[name].far for name in methods)
-        future = pool.submit(recording.find_far_surfaces, key) if wants_far else None
+        far_task = pool.submit(recording.find_far_surfaces, key) if wants_far else None
         with_flow = settings.output.flow != "none"
         moments = {
             name: recording.moment(key, METHODS[name].all_sweeps, METHODS[name].engine, with_flow)
             for name in methods
         }
-        far_surfaces = None if future is None else future.result()
-        if key == max(recording.cut.number_of):  # no later key needs them
+        far_surfaces = None if far_task is None else far_task.result()
+        if key == max(recording.cut.number_of):  # no later key needs the raw sweeps
             recording.sweeps.read.cache_clear()
 
         # See, project, fill and score the points, method by method.
         cloud = moments[methods[-1]].cloud
-        scene = scene_of(recording, key, shots, images, far_surfaces, cloud, with_images, watch)
-        del cloud  # its method replaces it, and must not hold both
+        scene = scene_of(
+            recording, key, shots, images, far_surfaces, cloud, with_images=with_images, watch=watch
+        )
+        del cloud  # the method replaces this cloud, and memory must not hold both
         are_filled = [settings.is_scored or name == methods[-1] for name in methods]
         make = partial(result_of_method, scene, moments)
         results = list(pool.map(make, methods, are_filled))
@@ -236,10 +249,14 @@ def scene_of(
     with_images: bool,
     watch: Watch,
 ) -> KeyScene:
-    """Return the shared inputs of a key's methods.
+    """Return the inputs that all methods of a key share.
 
-    ``shots`` and ``images`` (H,W,3) are by map name. ``cloud`` says which points of the key sweep
-    move.
+    Args:
+        shots: Map name -> camera, image number and exposure time.
+        images: Map name -> (H,W,3) RGB image.
+        far_surfaces: Static surfaces beyond the window; None leaves them out.
+        cloud: Accumulated points, which say what moves in the key sweep that is held out.
+        with_images: Colour the cloud, and score depth if there is ground truth.
     """
     sequence, settings = recording.sequence, recording.settings
     stretch = recording.window(key)
@@ -250,9 +267,17 @@ def scene_of(
     if settings.is_scored:
         with watch.stage("held out"):
             held_out = HeldOut.of(views, cloud)
-    shown = images if with_images else {}
     return KeyScene(
-        settings, key, stretch, far_surfaces, key_image, views, shown, truth, held_out, watch
+        settings=settings,
+        key=key,
+        stretch=stretch,
+        far_surfaces=far_surfaces,
+        key_image=key_image,
+        views=views,
+        images=images if with_images else {},
+        truth=truth,
+        held_out=held_out,
+        watch=watch,
     )
 
 

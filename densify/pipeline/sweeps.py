@@ -22,7 +22,7 @@ BLOCK_S = 2.0
 
 
 class Sweeps:
-    """Reader of raw sweeps that drops the returns of the own vehicle."""
+    """Reader of raw sweeps that drops the returns of the ego vehicle."""
 
     def __init__(
         self,
@@ -34,7 +34,7 @@ class Sweeps:
         run: str | None,
         watch: Watch,
     ) -> None:
-        """Prepare to read. ``num_kept`` sweeps are kept in memory.
+        """Prepare to read sweeps, of which ``num_kept`` are kept in memory.
 
         Processes of one ``run`` share the digests of sweeps through the cache on disk.
         """
@@ -49,15 +49,16 @@ class Sweeps:
         self.content = lru_cache(maxsize=None)(self._content)
 
     def prepare(self, frames: Sequence[int]) -> None:
-        """Let a recording that simulates its sweeps render these frames in parallel."""
-        if hasattr(self._sequence, "prepare"):
-            with self.watch.stage("read"):
-                for done in range(0, len(frames), _RENDERED_TOGETHER):
-                    self.watch.report("read", done, len(frames))
-                    self._sequence.prepare(frames[done : done + _RENDERED_TOGETHER])
+        """Render the sweeps of these frames in parallel if the recording simulates its sweeps."""
+        if not hasattr(self._sequence, "prepare"):  # sweeps are in files
+            return
+        with self.watch.stage("read"):
+            for done in range(0, len(frames), _RENDERED_TOGETHER):
+                self.watch.report("read", done, len(frames))
+                self._sequence.prepare(frames[done : done + _RENDERED_TOGETHER])
 
     def recorded_pose(self, frame: int) -> Float | None:
-        """Return the recording's ``T_world_lidar`` (4,4), None if the settings ignore it."""
+        """Return the recording's ``T_world_lidar`` (4,4); None if the settings ignore the pose."""
         if self._settings.source != "dataset":
             return None
         return self._sequence.T_world_lidar(frame)
@@ -93,9 +94,9 @@ class Sweeps:
 
 @dataclass(frozen=True)
 class Cut:
-    """Blocks of consecutive sweeps that are computed together, in time order; they may overlap."""
+    """Blocks of consecutive sweeps that are computed together. Blocks may overlap in time."""
 
-    # Frame numbers of each block: the windows of its keys, and the sweeps between and around them
+    # Frame numbers of each block, in time order: the windows of its keys, sweeps between and around
     blocks: tuple[tuple[int, ...], ...]
     number_of: Mapping[int, int]  # key -> index of its block
 
@@ -105,7 +106,7 @@ class Cut:
 
     @staticmethod
     def of(timeline: Timeline, window: int, keys: Collection[int], beyond_s: float = 0.0) -> Cut:
-        """Return the blocks around the windows of some keys.
+        """Return the cut of a recording into blocks around the windows of some keys.
 
         Consecutive keys share a block if their windows overlap and the key is less than `BLOCK_S`
         after the block's first key.
@@ -122,7 +123,7 @@ class Cut:
         for key in keys:
             check_key(key)
         groups = _group_keys(timeline, window, sorted(set(keys)))
-        # A block reaches from the first window, longer by ``beyond_s``, to the last.
+        # A block reaches from its first window to its last one, both longer by ``beyond_s``.
         num_beside = window + round(beyond_s * 1e9 / timeline.period_ns)
         blocks = []
         for group in groups:
@@ -136,11 +137,12 @@ class Cut:
 def _group_keys(timeline: Timeline, window: int, keys: Sequence[int]) -> list[list[int]]:
     """Return ascending keys in groups that share a block."""
     groups: list[list[int]] = []
-    last_row = -1  # row of the last sweep in the window of the key before; no window overlaps -1
+    last_row = -1  # row of the last sweep in the window of the key before; -1 is before them all
     for key in keys:
         frames = timeline.window(key, window).frames
         overlaps = timeline.row[frames[0]] <= last_row
-        if overlaps and (timeline.stamp_of(key) - timeline.stamp_of(groups[-1][0]) < BLOCK_S * 1e9):
+        since_first_ns = timeline.stamp_of(key) - timeline.stamp_of(groups[-1][0]) if groups else 0
+        if overlaps and since_first_ns < BLOCK_S * 1e9:
             groups[-1].append(key)
         else:
             groups.append([key])

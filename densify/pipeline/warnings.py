@@ -32,7 +32,7 @@ _MAX_NEAR, _MAX_BELOW, _MAX_MOVING = 0.2, 0.0025, 1 / 3
 def add_warnings(
     results: Mapping[str, Result], recording: Recording, key: int, shots: Mapping[str, Shot]
 ) -> dict[str, Result]:
-    """Return the ``results`` of one key, by method, with the field ``warnings`` filled in."""
+    """Return the results of one key, by method, with the field ``warnings`` filled in."""
     sequence = recording.sequence
     stretch = recording.window(key)
     cameras = {shot.camera.name for shot in shots.values()}
@@ -86,7 +86,7 @@ def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"are left out, and motion is less certain"
         )
     num_near = sum(sweep.num_near for sweep in sweeps)
-    share_near = num_near / max(num_near + sum(len(sweep) for sweep in sweeps), 1)
+    share_near = num_near / max(num_near + sum(map(len, sweeps)), 1)
     if share_near > _MAX_NEAR:
         yield (
             f"register.min_range_m = {settings.register.min_range_m:g} takes "
@@ -99,7 +99,7 @@ def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
             f"{100 * share_below:.1f} % of the points lie below the ground, as mirror images of a "
             f"wet road and echoes over two surfaces do; they are left out"
         )
-    if share_near <= _MAX_NEAR:  # else sweeps may lack the returns of the own vehicle
+    if share_near <= _MAX_NEAR:  # else sweeps may lack the returns of the ego vehicle
         yield from _warn_of_sectors(recording, [sweep.frame for sweep in sweeps])
 
 
@@ -128,8 +128,9 @@ def _warn_of_sectors(recording: Recording, frames: Sequence[int]) -> Iterator[st
         )
     sector = blind_sector(returns)
     if sector is not None:
+        first_deg, last_deg = sector
         yield (
-            f"no sweep has a return from {sector[0]} to {sector[1]} deg of azimuth "
+            f"no sweep has a return from {first_deg} to {last_deg} deg of azimuth "
             f"(counterclockwise from x): a blind sector; depth there is filled in or missing"
         )
 
@@ -158,11 +159,11 @@ def _warn_of_recorded_poses(recording: Recording, key: int) -> Iterator[str]:
     row = timeline.row[key]
     num_beside = max(len(recording.window(key).frames) // 2, _LEAST_SIDE)
     neighbours = timeline.frames[max(row - num_beside, 0) : row + num_beside + 1]
-    (run,) = (frames for frames in timeline.split_at_holes(neighbours) if key in frames)
-    settings = replace(recording.settings.register, source="kiss-icp")
+    (run,) = (run for run in timeline.split_at_holes(neighbours) if key in run)
+    by_odometry = replace(recording.settings.register, source="kiss-icp")
     try:
         sweeps = [recording.sweeps.read(frame) for frame in run]
-        odometry = find_trajectory(sweeps, settings).T_world_lidar
+        odometry = find_trajectory(sweeps, by_odometry).T_world_lidar
         recorded = [recording.sequence.T_world_lidar(frame) for frame in (run[0], run[-1])]
     except InputError:
         return  # too short or too poor to compare
@@ -198,7 +199,7 @@ def _warn_of_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> Itera
 
 
 def warn_of_result(result: Result, stretch: Stretch) -> Iterator[str]:
-    """Yield the warnings about the result of one method; ``stretch`` holds the window's sweeps."""
+    """Yield the warnings about the result of one method on the window's sweeps (``stretch``)."""
     stamps_ns = [registered.sweep.stamp_ns for registered in stretch.sweeps]
     if METHODS[result.method].engine is not None and len(stamps_ns) > 1:
         period_s = float(np.median(np.diff(stamps_ns))) * 1e-9

@@ -20,8 +20,8 @@ from densify.geometry.types import Float, Int, RegisteredSweep, Stretch, Sweep, 
 def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
     """Return raw sweeps at their poses, with the lidar's motion within each sweep removed.
 
-    Points before the reference time move with the velocity from the previous sweep, points after it
-    with the velocity to the next sweep. A sweep without point times keeps its points.
+    Points fired before the reference time move with the velocity from the previous sweep, later
+    points with the velocity to the next sweep. A sweep without point times keeps its points.
 
     Args:
         sweeps: Raw sweeps, ascending in time.
@@ -37,12 +37,12 @@ def deskew(sweeps: Sequence[Sweep], trajectory: Trajectory) -> Stretch:
 def deskew_sweep(
     sweep: Sweep, T_world_lidar: Float, twist_before: Float, twist_after: Float
 ) -> RegisteredSweep:
-    """Return a deskewed copy of the sweep with its (4,4) pose at the reference time.
+    """Return a deskewed copy of a sweep together with its pose.
 
     Args:
-        sweep: The raw sweep.
-        T_world_lidar: (4,4) its pose.
-        twist_before: (6,) velocity of the lidar before that time, rad/s, m/s, lidar frame.
+        sweep: The raw sweep. Without point times its points stay as they are.
+        T_world_lidar: (4,4) pose of the lidar at the reference time.
+        twist_before: (6,) velocity (rad/s, m/s) of the lidar before that time, lidar frame.
         twist_after: (6,) velocity of the lidar after that time.
     """
     points: Float = sweep.points
@@ -53,20 +53,23 @@ def deskew_sweep(
 
 
 def deskew_points(sweep: Sweep, twist: Float) -> Float:
-    """Return the (N,3) points deskewed by a (6,) velocity (rad/s, m/s), lidar frame."""
+    """Return a sweep's points (N,3) deskewed by one velocity (6,), rad/s and m/s, lidar frame."""
     return deskew_sweep(sweep, np.eye(4), twist, twist).sweep.points
 
 
 def twists(trajectory: Trajectory, i: int) -> tuple[Float, Float]:
-    """Return (6,) velocities (rad/s, m/s) before and after sweep i, lidar frame."""
+    """Return the lidar's velocities (6,), rad/s and m/s, before and after sweep i, lidar frame.
+
+    At an end of the trajectory both are equal, and 0 if it has a single sweep.
+    """
     T, stamp_ns, last = trajectory.T_world_lidar, trajectory.stamp_ns, len(trajectory.frames) - 1
-    if last == 0:  # the velocity of a single sweep is unknown
+    if last == 0:
         return np.zeros(6), np.zeros(6)
-    before, after = (
+    twist_before, twist_after = (
         poses.twist_between(T[i], T[neighbour], (stamp_ns[neighbour] - stamp_ns[i]) * 1e-9)
         for neighbour in (i - 1 if i > 0 else 1, i + 1 if i < last else i - 1)
     )
-    return before, after
+    return twist_before, twist_after
 
 
 LEAST_SHARPNESS = 4.0  # least sharpness of a scanner with distinct rings
@@ -76,12 +79,12 @@ COMPENSATED_M = 25.0  # range within which motion during the sweep is visible
 
 
 class Rings(NamedTuple):
-    """The sharpness of a sweep's rings under three assumptions, see `sharpness`."""
+    """The `sharpness` of a sweep's rings under three assumptions; 1 for points spread evenly."""
 
     as_stored: float  # sharpness of the points as they are
     undone: float  # sharpness after undoing a motion compensation to ``moment``
     done: float  # sharpness after compensating the motion
-    moment: str  # time within the sweep, in words
+    moment: str  # time, in words, to which that compensation moved the points
 
     @property
     def are_distinct(self) -> bool:
@@ -95,11 +98,11 @@ class Rings(NamedTuple):
 
 
 def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
-    """Return how sharply points are concentrated in rings, as seen from an origin; 1 if not at all.
+    """Return how sharply points are concentrated in rings, as seen from an origin.
 
     Elevations are divided into cells, and about 100 cells form a window. Sharpness is the
-    probability that two returns of a window share a cell, relative to an even spread. The median
-    over the windows keeps flat ground, which lies in one window, from dominating.
+    probability that two returns of a window share a cell, relative to an even spread, which has 1.
+    The median over the windows keeps flat ground, which lies in one window, from dominating.
 
     Args:
         points: (N,3) metres, in axes with z along the spin axis.
@@ -109,19 +112,18 @@ def sharpness(points: Float, origin_m: Float, bins: int = 1) -> float:
     x, y, z = (points - origin_m).T
     elevation = np.arctan2(z, np.hypot(x, y))
     cell_rad = bins * np.deg2rad(0.02)
-    width = max(8, 100 // bins)  # cells of a window
-    num_cells = int(np.pi / cell_rad + 1)
-    num_windows = -(-num_cells // width)  # rounded up
+    window_cells = max(8, 100 // bins)  # number of cells of a window
+    num_windows = -(-int(np.pi / cell_rad + 1) // window_cells)  # rounded up
     cell = ((elevation + 0.5 * np.pi) / cell_rad).astype(np.int64)
-    count = np.bincount(cell, minlength=num_windows * width).astype(np.float64)
-    count = count.reshape(num_windows, width)
-    total = count.sum(axis=1)
-    is_populated = total > 0.01 * len(points)
+    counts = np.bincount(cell, minlength=num_windows * window_cells).astype(np.float64)
+    counts = counts.reshape(num_windows, window_cells)
+    totals = counts.sum(axis=1)
+    is_populated = totals > 0.01 * len(points)  # windows of fewer returns are ruled by chance
     if not is_populated.any():
         return 1.0
-    # An even spread has the probability 1 / width.
-    probability = (count[is_populated] ** 2).sum(axis=1) / total[is_populated] ** 2
-    return float(np.median(probability) * width)
+    # Two returns share a cell with probability Σ (count / total)², if even 1 / window_cells.
+    probability = (counts[is_populated] ** 2).sum(axis=1) / totals[is_populated] ** 2
+    return float(np.median(probability) * window_cells)
 
 
 def rings_by_motion(
@@ -162,14 +164,17 @@ def rings_by_motion(
 
 
 def sample_rows(sweep: Sweep, far_m: float) -> Int:
-    """Return the rows of at most 20,000 returns of a sweep, from 3 m to ``far_m`` away."""
+    """Return the rows of at most 20,000 returns of a sweep that are 3 to ``far_m`` metres away."""
     range_m = np.linalg.norm(sweep.points, axis=1)
     rows = np.flatnonzero((range_m > 3.0) & (range_m < far_m))  # nearer may be the vehicle
     return rows[:: len(rows) // 20_000 + 1]
 
 
 def turning_s(points: Float, period_s: float) -> Float:
-    """Return (N,) seconds since the stamp, by azimuth, of a clockwise turn from straight ahead."""
+    """Return the firing times (N,) of points, in seconds since the stamp, by their azimuth.
+
+    They hold for a clockwise turn of ``period_s`` whose middle, straight ahead, is at the stamp.
+    """
     turn: Float = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
     return turn * period_s
 

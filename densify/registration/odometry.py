@@ -41,14 +41,14 @@ _DAMPING = np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
 
 def subsample(sweep: Sweep, max_points: int = MANY_POINTS) -> Sweep:
     """Return about ``max_points`` points of a larger sweep, spread evenly over its rings."""
-    num = len(sweep)
-    if num <= max_points:
+    num_points = len(sweep)
+    if num_points <= max_points:
         return sweep
     # The multiples of the golden ratio, modulo 1, are spread evenly in [0, 1). Points below a
     # threshold are therefore an even sample of each ring, in any order of the rings.
-    fraction = np.arange(num) * 0.6180339887498949
+    fraction = np.arange(num_points) * 0.6180339887498949
     fraction -= np.floor(fraction)
-    return sweep.select(fraction < max_points / num)
+    return sweep.select(fraction < max_points / num_points)
 
 
 class Surface(NamedTuple):
@@ -59,7 +59,10 @@ class Surface(NamedTuple):
 
     @staticmethod
     def of(points: Float, voxel_m: float = 0.5, num_neighbors: int = 10) -> Surface:
-        """Return the surface of points (N,3), one per voxel, with normals, in their frame."""
+        """Return the surface of points (N,3), metres, thinned to one per voxel, in their frame.
+
+        ``num_neighbors`` is the number of neighbours that give a point's normal.
+        """
         return Surface(*small_gicp.preprocess_points(points, voxel_m, num_neighbors, 1))
 
     @staticmethod
@@ -87,7 +90,7 @@ def make_map() -> Any:
 
 
 def align(target: Any, source: Any, T_target_source: Float, match_m: float) -> Alignment:
-    """Align a source with a target, and return the alignment.
+    """Align a source with a target from an initial pose.
 
     A source `Surface` is aligned by generalized ICP, other points are aligned point to plane.
 
@@ -127,8 +130,8 @@ def register_on_surfaces(
             in the lidar frame, from `find_odometry`. None predicts constant velocity.
 
     Returns:
-        The (S,4,4) poses in the frame of the first sweep, and (N,3) deskewed points of each sweep
-            in that frame, at most about 15,000.
+        T_first_lidar: (S,4,4) poses in the lidar frame of the first sweep.
+        points: For each sweep at most about 15,000 deskewed points (N,3), metres, in that frame.
     """
     series = _SweepSeries(sweeps, twists)
     if twists is not None:
@@ -139,8 +142,8 @@ def register_on_surfaces(
     # to measure the velocity, and registered again with all sweeps.
     searched_twist = search_twist(series.stamp_ns, [sweep.points for sweep in sweeps])
     end_ns = series.stamp_ns[0] + _SURFACE_NS
-    num = int(np.searchsorted(series.stamp_ns, end_ns, side="right"))
-    T, _ = _SweepSeries(sweeps[:num], None).register(searched_twist)
+    num_in_second = int(np.searchsorted(series.stamp_ns, end_ns, side="right"))
+    T, _ = _SweepSeries(sweeps[:num_in_second], None).register(searched_twist)
     # The first step between two sweeps that were both aligned with earlier ones
     first_aligned_step = min(_NUM_START + 1, len(T) - 1)
     return series.register(poses.twist_to(T, series.stamp_ns, first_aligned_step))
@@ -151,7 +154,7 @@ class _PosedSurface(NamedTuple):
 
     surface: Surface  # the surface, in its own frame
     T_world_surface: Float  # (4,4) its pose
-    latest: int  # index of the surface's sweep that is nearest to the aligned sweeps
+    nearest: int  # index of the surface's sweep that is nearest in time to the aligned sweeps
 
 
 class _SweepSeries:
@@ -174,15 +177,18 @@ class _SweepSeries:
         self._surface: _PosedSurface | None = None  # the surface in use
 
     def register(self, twist: Float) -> tuple[Float, list[Float]]:
-        """Return the poses and points of `register_on_surfaces`, from an initial velocity (6,)."""
+        """Return poses (S,4,4) and deskewed points (N,3) of each sweep, in the first sweep's frame.
+
+        ``twist`` (6,), rad/s and m/s, is the velocity at the first sweep, lidar frame.
+        """
         # The first sweeps have too few sweeps before them for a surface. They keep their
         # predictions, until the sweeps after them are aligned.
-        num = len(self._sweeps)
-        num_start = min(_NUM_START, num // 2)
+        num_sweeps = len(self._sweeps)
+        num_start = min(_NUM_START, num_sweeps // 2)
         self._points[0] = deskew_points(self._sweeps[0], twist)
-        for i in range(1, num):
+        for i in range(1, num_sweeps):
             twist = self._align_sweep(i, i - 1, twist, is_predicted=i < num_start)
-        if num > 2:
+        if num_sweeps > 2:
             # The step to sweep num_start + 1 is the first one between two aligned sweeps.
             twist = poses.twist_to(self._T, self.stamp_ns, num_start + 1)
             self._surface = None  # the surface in use is of later sweeps
@@ -190,7 +196,7 @@ class _SweepSeries:
                 twist = self._align_sweep(i, i + 1, twist)
         # From the world of the alignment to the frame of the first sweep, whose pose is exactly I
         T_first_world = poses.inverse(self._T[0])
-        points = [poses.transform(T_first_world, self._points[i]) for i in range(num)]
+        points = [poses.transform(T_first_world, self._points[i]) for i in range(num_sweeps)]
         return np.stack([np.eye(4), *(T_first_world @ T for T in self._T[1:])]), points
 
     def _align_sweep(
@@ -225,9 +231,10 @@ class _SweepSeries:
     def _surface_for(self, i: int, adjacent: int) -> _PosedSurface:
         """Return a surface to align sweep i with: the one in use, or one of the nearest second."""
         since_ns = np.abs(self.stamp_ns - self.stamp_ns[i])
-        if self._surface is not None and since_ns[self._surface.latest] < FRESH_NS:
+        if self._surface is not None and since_ns[self._surface.nearest] < FRESH_NS:
             return self._surface
-        # The nearest sweep first, at any distance in time, and at most about 10 sweeps
+        # The nearest sweep first, at any distance in time. About 10 sweeps, a second at the usual
+        # rate, suffice: a faster scanner's sweeps are thinned to save time.
         side = range(i - 1, -1, -1) if adjacent < i else range(i + 1, len(self._sweeps))
         neighbours = [j for j in side if j == adjacent or since_ns[j] <= _SURFACE_NS]
         chosen = neighbours[:: max(1, round(len(neighbours) / 10))]
@@ -244,19 +251,19 @@ def _align_once(surface: Surface, points: Float, T_surface_lidar: Float, match_m
     source = small_gicp.voxelgrid_sampling(points, _VOXEL_M)
     T_aligned, _, information = align(surface, source, T_surface_lidar, match_m)
     # A damped Gauss-Newton step towards the aligned pose: directions that few matches constrain
-    # hardly move.
-    gradient = information @ poses.log(poses.inverse(T_surface_lidar) @ T_aligned)
-    motion = np.linalg.solve(information + _DAMPING, gradient)
-    return np.asarray(T_surface_lidar @ poses.exp(np.asarray(motion, np.float64)))
+    # hardly move. The step solves (information + damping) step = information · undamped step.
+    undamped = poses.log(poses.inverse(T_surface_lidar) @ T_aligned)
+    step = np.linalg.solve(information + _DAMPING, information @ undamped)
+    return np.asarray(T_surface_lidar @ poses.exp(np.asarray(step, np.float64)))
 
 
 def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
-    """Return the (S,6) approximate velocities (rad/s, m/s) of S >= 2 raw sweeps, by KISS-ICP.
+    """Return approximate velocities (S,6), rad/s and m/s, of S >= 2 raw sweeps, by KISS-ICP.
 
     Each is that of the step from the preceding sweep, in the lidar frame. The first equals the
     second. Only points above the ground are used: rings on flat ground look the same at any speed.
-    KISS-ICP assumes a start at rest. Therefore `search_twist` starts it, and sweeps of a fast
-    scanner are registered about 0.1 s apart.
+    KISS-ICP assumes a start at rest. Therefore a grid search gives it the first velocity, and
+    sweeps of a fast scanner are registered about 0.1 s apart.
     """
     from kiss_icp.config import KISSConfig
     from kiss_icp.kiss_icp import KissICP
@@ -282,33 +289,34 @@ def find_odometry(sweeps: Sequence[Sweep], settings: RegisterSettings) -> Float:
 
     odometry.register_frame(points[0], no_times)
     twists = [search_twist(chosen_ns, [sweeps[i].points for i in chosen])]
-    for sweep_points, seconds in zip(points[1:], np.diff(chosen_ns) * 1e-9, strict=True):
+    for sweep_points, step_s in zip(points[1:], np.diff(chosen_ns) * 1e-9, strict=True):
         # KISS-ICP predicts the motion of the last step again. The steps may differ in duration.
-        odometry.last_delta = poses.exp(twists[-1] * seconds)
+        odometry.last_delta = poses.exp(twists[-1] * step_s)
         odometry.register_frame(sweep_points, no_times)
-        twists.append(poses.log(odometry.last_delta) / seconds)
+        twists.append(poses.log(odometry.last_delta) / step_s)
     # Velocity k is that of the step to chosen sweep k. Number 0 is only the searched velocity. Each
-    # sweep gets the velocity of the step that it lies in.
+    # sweep gets the velocity of the step during which it was measured.
     step = np.searchsorted(chosen_ns, stamp_ns).clip(1, len(chosen) - 1)
     return np.stack(twists)[step]
 
 
 def search_twist(stamp_ns: Int, points: Sequence[Float]) -> Float:
-    """Return the (6,) initial velocity (rad/s, m/s), without rotation, by a grid search.
+    """Return the initial velocity (6,), rad/s and m/s, lidar frame, from a grid without rotation.
 
-    It is the velocity that best aligns the points above the ground in the first three sweeps. The
-    grid moves the second sweep by steps of 1 m, then by 0.5 m around the best position. The steps
-    are shorter for sweeps less than 0.1 s apart.
+    This velocity best aligns the points above the ground in the first three sweeps. The grid moves
+    the second sweep by steps of 1 m, then by 0.5 m around the best position. The steps are shorter
+    for sweeps less than 0.1 s apart.
 
     Args:
         stamp_ns: (S,) reference times of the sweeps.
         points: (N,3) of each sweep, metres, in its own lidar frame.
     """
-    # The first two steps, of which the second may have another duration
+    # Durations of the steps between the first three sweeps, which may differ
     step_s = np.diff(stamp_ns[:3]) * 1e-9
     pairs = []
     for i, (earlier, later) in enumerate(pairwise(map(above_ground, points[:3]))):
-        _, rows = np.unique(np.floor(later), axis=0, return_index=True)  # even over 1 m voxels
+        # At most 800 points, spread evenly over voxels of 1 m, suffice for the speed.
+        _, rows = np.unique(np.floor(later), axis=0, return_index=True)
         sample = later[rows[:: len(rows) // 800 + 1]]
         # Neighbouring rays are about 0.01 rad apart.
         ray_gap_m = 0.01 * np.linalg.norm(sample, axis=1)
@@ -354,9 +362,9 @@ def _step_cost_m(steps_m: Float, pairs: Sequence[_SweepPair]) -> Float:
 
 
 def above_ground(points: Float) -> Float:
-    """Return those of (N,3) points over 0.4 m above the lowest point of their 1 m cell.
+    """Return the points that are more than 0.4 m above the lowest point of their 1 m cell.
 
-    Returns all points if none is.
+    If no point is, all points are returned. ``points`` are (N,3) metres with z up.
     """
     if not len(points):
         return points

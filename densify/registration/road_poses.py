@@ -21,14 +21,7 @@ from densify.geometry import poses
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Bool, Float, Int, RegisteredSweep, Sweep
 from densify.registration.deskew import deskew_points
-from densify.registration.odometry import (
-    FEW_POINTS,
-    Alignment,
-    Surface,
-    align,
-    make_map,
-    subsample,
-)
+from densify.registration.odometry import FEW_POINTS, Alignment, Surface, align, make_map, subsample
 from densify.registration.trajectory import MIN_NUM_POINTS, MIN_OVERLAP, find_jump
 
 _PAIR_DISTANCES = (1, 4, 8)  # of the aligned pairs, in submaps
@@ -46,9 +39,9 @@ def follow_road(
 ) -> Iterator[tuple[RegisteredSweep, Surface]]:
     """Register raw sweeps along the road one after another, and yield each with its surface.
 
-    Each sweep is aligned with a map of the sweeps before it, starting at constant velocity. The
-    chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or needs an
-    implausible vehicle motion. Surfaces are deskewed, in their sweep's lidar frame.
+    Each sweep is aligned with a map of the sweeps before, from a pose predicted at constant
+    velocity. The chain ends at a sweep that cannot be read, is too sparse, does not fit the map, or
+    needs an implausible vehicle motion. Surfaces are deskewed, in their sweep's lidar frame.
 
     Args:
         window_sweeps: Registered sweeps of the window, the one next to ``frames`` last.
@@ -62,17 +55,19 @@ def follow_road(
     chain = make_map()
     for registered, surface in zip(window_sweeps, window_surfaces, strict=True):
         chain.insert(surface.points, registered.T_world_lidar)
-    latest = window_sweeps[-1]
-    T_world_lidar, latest_ns = latest.T_world_lidar, latest.sweep.stamp_ns
-    is_backwards = len(frames) > 0 and stamp_ns[0] < latest_ns
-    twist = latest.twist_before if is_backwards else latest.twist_after
+    end_of_window = window_sweeps[-1]
+    # Pose and time of the end of the chain, and the velocity there
+    T_world_lidar, end_ns = end_of_window.T_world_lidar, end_of_window.sweep.stamp_ns
+    is_backwards = len(frames) > 0 and stamp_ns[0] < end_ns
+    twist = end_of_window.twist_before if is_backwards else end_of_window.twist_after
     travel_m = 0.0
     # The sweep nearest to the wanted gap is registered: a sweep is skipped if even the middle
-    # between it and the next one lies within the gap, because the next one is then nearer.
-    middle_ns = stamp_ns + np.diff(stamp_ns, append=stamp_ns[-1:]) / 2
-    for frame, time_ns, to_next_ns in zip(frames, stamp_ns.tolist(), middle_ns, strict=True):
+    # between this and the next sweep lies within the gap, because the next one is then nearer.
+    middles_ns = stamp_ns + np.diff(stamp_ns, append=stamp_ns[-1:]) / 2
+    for frame, frame_ns, middle_ns in zip(frames, stamp_ns.tolist(), middles_ns, strict=True):
+        # Even a slow vehicle's sweeps are at most about 0.4 s apart, for the prediction's sake.
         gap_s = min(0.4, step_m / max(float(np.linalg.norm(twist[3:])), 1e-3))
-        is_near = abs(to_next_ns - latest_ns) < 1e9 * gap_s and frame != frames[-1]
+        is_near = abs(middle_ns - end_ns) < 1e9 * gap_s and frame != frames[-1]
         if travel_m >= reach_m or is_near:
             continue
         try:
@@ -81,7 +76,7 @@ def follow_road(
             return
         if len(sweep) < MIN_NUM_POINTS:
             return
-        step_s = (time_ns - latest_ns) * 1e-9
+        step_s = (frame_ns - end_ns) * 1e-9
         # Constant velocity predicts the pose, and deskews the sweep for the alignment.
         T_guess = T_world_lidar @ poses.exp(twist * step_s)
         guessed_surface = Surface.of(deskew_points(subsample(sweep, FEW_POINTS), twist))
@@ -92,7 +87,7 @@ def follow_road(
             return
         surface = Surface.of(deskew_points(subsample(sweep), twist))  # by the measured velocity
         chain.insert(surface.points, T_aligned)
-        T_world_lidar, latest_ns = T_aligned, time_ns
+        T_world_lidar, end_ns = T_aligned, frame_ns
         travel_m += float(np.linalg.norm(twist[3:])) * abs(step_s)
         yield RegisteredSweep(sweep, T_world_lidar, twist, twist), surface
 
@@ -168,8 +163,8 @@ def relax_poses(
 
 def _group_into_submaps(is_known: Bool, num_sweeps: int) -> tuple[Int, Int]:
     """Return (n,) the ascending submap of each sweep, and (m,) the middle sweep of each submap."""
-    # A submap has either known sweeps or others. Submaps are counted from the known sweeps, hence
-    # incomplete ones lie at both ends of the road, and after the last known sweep.
+    # A submap has either known sweeps or others. Submaps are counted from the known sweeps.
+    # Therefore incomplete submaps lie at both ends of the road and after the last known sweep.
     first, last = np.flatnonzero(is_known)[[0, -1]]
     row = np.arange(len(is_known))
     after_known = (last - first) // num_sweeps + 1 + (row - last - 1) // num_sweeps
@@ -203,20 +198,22 @@ class _Graph:
         return T
 
     def are_connected(self, T: Float) -> Bool:
-        """Return (m,) True for submaps that reliable alignments at T (m,4,4) connect to fixed."""
-        target, source = self._ends.T
-        is_wrong = self._error_m(self._residual(T)) > 0.1
-        # Gap k lies between submaps k and k + 1.
+        """Return (m,) True for submaps that reliable gaps connect to fixed ones, at T (m,4,4)."""
+        target, source = self._ends.T  # submap numbers; a target is below its source
+        is_wrong = self._error_m(self._residual(T)) > 0.1  # good alignments: at most 0.03 m
+        # Gap k lies between submaps k and k + 1. A single wrong alignment does not break the gap.
         gap = np.arange(len(self._is_fixed) - 1)
         spans = (target[:, None] <= gap) & (source[:, None] > gap)
         is_reliable = (is_wrong[:, None] & spans).sum(axis=0) <= 0.25 * spans.sum(axis=0)
+        # Neighbouring submaps that share less than half of their surface show different places.
         is_adjacent = source - target == 1
         is_reliable[target[is_adjacent]] &= self._overlap[is_adjacent] >= 0.5
         # A submap is connected if all gaps on its way to the fixed submaps are reliable.
-        first, last = np.flatnonzero(self._is_fixed)[[0, -1]]
+        first_fixed, last_fixed = np.flatnonzero(self._is_fixed)[[0, -1]]
         connected = np.ones(len(self._is_fixed), bool)
-        connected[:first] = np.logical_and.accumulate(is_reliable[:first][::-1])[::-1]
-        connected[last + 1 :] = np.logical_and.accumulate(is_reliable[last:])
+        gaps_before, gaps_after = is_reliable[:first_fixed], is_reliable[last_fixed:]
+        connected[:first_fixed] = np.logical_and.accumulate(gaps_before[::-1])[::-1]
+        connected[last_fixed + 1 :] = np.logical_and.accumulate(gaps_after)
         return connected
 
     def _T_target_source(self, T: Float) -> Float:
@@ -234,21 +231,29 @@ class _Graph:
 
     def _step(self, T: Float) -> Float:
         """Return (f,6) the next Gauss-Newton step of each free submap, in its own frame."""
+        # The step x minimises Σ w (r + J x)ᵀ Ω (r + J x) over the alignments, with residual r,
+        # Jacobian J, information Ω, and Cauchy weight w, which limits wrong alignments.
         residual = self._residual(T)
-        # Cauchy weights, which limit the influence of wrong alignments
         weight = 1 / (1 + (self._error_m(residual) / _USUAL_M) ** 2)
-        # Derivative of the residual by the motions of the target (first 6) and of the source
-        adjoint = poses.transform_twist(poses.inverse(self._T_target_source(T))[:, None], np.eye(6))
-        slope = np.zeros((len(residual), 6, 12))
-        slope[:, :, :6] = -adjoint.transpose(0, 2, 1)
-        slope[:, :, 6:] = np.eye(6)
-        weighted = slope.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
-        # Normal equations of 6 unknowns per submap. Fixed submaps share unknowns after all others,
-        # which are cut off.
-        num = 6 * int((~self._is_fixed).sum())
-        first = np.where(self._is_fixed, num, 6 * (np.cumsum(~self._is_fixed) - 1))
-        unknown = (first[self._ends][:, :, None] + np.arange(6)).reshape(-1, 12)
+        # The first six columns of J are minus the target's motion, seen in the source's frame, the
+        # last six the source's own. Row k of ``images``, of unit twist k, is minus column k of J.
+        T_source_target = poses.inverse(self._T_target_source(T))
+        images = poses.transform_twist(T_source_target[:, None], np.eye(6))
+        jacobian = np.zeros((len(residual), 6, 12))
+        jacobian[:, :, :6] = -images.transpose(0, 2, 1)
+        jacobian[:, :, 6:] = np.eye(6)
+        weighted = jacobian.transpose(0, 2, 1) @ (weight[:, None, None] * self._information)
+        return self._solve(weighted @ jacobian, weighted @ residual[:, :, None])
+
+    def _solve(self, matrices: Float, gradients: Float) -> Float:
+        """Solve the normal equations, sums of (p,12,12) matrices and (p,12,1) gradients; (f,6)."""
+        # Each free submap has 6 unknowns. Fixed submaps share 6 more at the end, which are cut off.
+        is_free = ~self._is_fixed
+        num_unknowns = 6 * int(is_free.sum())
+        first_unknown = np.where(is_free, 6 * (np.cumsum(is_free) - 1), num_unknowns)
+        unknown = (first_unknown[self._ends][:, :, None] + np.arange(6)).reshape(-1, 12)
         row, column = np.broadcast_arrays(unknown[:, :, None], unknown[:, None, :])
-        matrix = sparse.csc_matrix(((weighted @ slope).ravel(), (row.ravel(), column.ravel())))
-        gradient = np.bincount(unknown.ravel(), (weighted @ residual[:, :, None]).ravel())
-        return -spsolve(matrix[:num, :num], gradient[:num]).reshape(-1, 6)
+        matrix = sparse.csc_matrix((matrices.ravel(), (row.ravel(), column.ravel())))
+        gradient = np.bincount(unknown.ravel(), gradients.ravel())
+        step = -spsolve(matrix[:num_unknowns, :num_unknowns], gradient[:num_unknowns])
+        return step.reshape(-1, 6)

@@ -43,7 +43,7 @@ class LeftOut(NamedTuple):
     unfit: bool = False
 
     def error(self, frame: int) -> InputError | SweepError:
-        """Return the error to raise if the sweep is indispensable."""
+        """Return the error to raise if the sweep ``frame`` is indispensable."""
         if self.unreadable:
             return InputError(self.reason)
         return (UnfitSweepError if self.unfit else UnplacedSweepError)(self.reason, frame)
@@ -69,6 +69,7 @@ def find_trajectory(
 
     Args:
         sweeps: Raw sweeps, ascending in time.
+        settings: Source of the poses, and range of the points.
         recorded: Recorded poses of these sweeps, None to register them.
 
     Returns:
@@ -147,14 +148,15 @@ def check_plausible(trajectory: Trajectory, settings: RegisterSettings) -> None:
 
 
 def find_jump(twist: Float, previous_twist: Float | None, step_s: float) -> str:
-    """Return, in words, why no vehicle can make a step between two sweeps; "" if one can.
+    """Return a clause that says why no vehicle can make a step between two sweeps, "" if one can.
 
     Args:
         twist: (6,) velocity of the step (rad/s, m/s).
         previous_twist: (6,) velocity of the previous step, None if unknown.
         step_s: Duration of the step.
     """
-    # Errors of both poses, 0.5 m, appear as a speed, the greater the shorter the step.
+    # Errors of both poses, 0.5 m, appear as a speed, the greater the shorter the step. No vehicle
+    # turns by more than 150 degrees a second.
     slack_m_s = 0.5 / step_s
     speed_m_s, turn_deg_s = np.linalg.norm(twist[3:]), np.rad2deg(np.linalg.norm(twist[:3]))
     if not (speed_m_s <= MAX_SPEED_M_S + slack_m_s and turn_deg_s <= 150.0):
@@ -184,14 +186,15 @@ def check_overlap(
     Args:
         points: (N,3) of each sweep, deskewed, metres, world.
         trajectory: Poses of these sweeps.
+        settings: Source of the poses, for the advice in the message.
     """
     frames, stamp_ns = trajectory.frames, trajectory.stamp_ns
     points_above = [above_ground(sweep_points) for sweep_points in points]
     trees = [tree_of(sweep_points) for sweep_points in points_above]
     for i in range(1, len(points)):
         # At least the previous sweep counts, however long ago it was.
-        first = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - FRESH_NS)), i - 1)
-        share = _share_on(points_above[i], trees[first:i])
+        first_fresh = min(int(np.searchsorted(stamp_ns, stamp_ns[i] - FRESH_NS)), i - 1)
+        share = _share_on(points_above[i], trees[first_fresh:i])
         if share < MIN_OVERLAP and stamp_ns[i] - stamp_ns[0] < FRESH_NS:
             # Few sweeps precede sweep i, hence those of the following third of a second count too.
             # They must also hold the points of the sweep before i: otherwise all sweeps from i on
@@ -213,11 +216,11 @@ def _share_on(points: Float, trees: Sequence[cKDTree]) -> float:
     """Return the share of (N,3) points within 0.5 m of any tree's points; 1 for few points."""
     if min(len(points), sum(tree.n for tree in trees)) < 200:
         return 1.0  # too few points for a decision
-    unmatched = points[:: len(points) // 2000 + 1]  # a sample, of which matches drop out
-    num = len(unmatched)
+    sample = points[:: len(points) // 2000 + 1]
+    unmatched = sample
     for tree in trees:
         unmatched = unmatched[~is_near(tree, unmatched, 0.5)]
-    return 1 - len(unmatched) / num
+    return 1 - len(unmatched) / len(sample)
 
 
 def _advice(settings: RegisterSettings) -> str:

@@ -113,8 +113,8 @@ def depth_edges(points: Float) -> Silhouettes:
 
         # The middle return is at an edge if it is nearer than the line through both neighbours.
         # Inverse range is linear on a plane at any slant.
-        share = gap[row - 1] / np.maximum(gap[row - 1] + gap[row], 1e-12)
-        straight_inverse = (1 - share) / range_m[before] + share / range_m[after]
+        fraction = gap[row - 1] / np.maximum(gap[row - 1] + gap[row], 1e-12)
+        straight_inverse = (1 - fraction) / range_m[before] + fraction / range_m[after]
         far = np.where(range_m[before] > range_m[after], before, after)
         deeper_m = np.maximum(_EDGE_M, _EDGE_SHARE * range_m[middle])
         is_edge = (range_m[far] - range_m[middle] > deeper_m) & (range_m[middle] < _FARTHEST_M)
@@ -130,7 +130,10 @@ def depth_edges(points: Float) -> Silhouettes:
 
 
 def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, float]:
-    """Return `View.strength` and `View.scale` of an (H,W,3) RGB image."""
+    """Return the gradients (2,h,w) of an (H,W,3) RGB image resized to 700 px of focal length.
+
+    They are horizontal, then vertical, minus their means. The second value is the scale h / H.
+    """
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     scale = _FOCAL_PX / focal_px
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
@@ -148,13 +151,13 @@ def image_edges(image: NDArray[np.uint8], focal_px: float) -> tuple[Float32, flo
 
 
 def turned(camera: Camera, offset: Float) -> Camera:
-    """Return the camera turned by pitch, yaw and roll (degrees) of an offset (4,), as in `Fit`."""
+    """Return the camera turned by an offset: degrees about its x, y and z, then an unused delay."""
     turn = poses.exp(np.append(np.deg2rad(offset[:3]), np.zeros(3)))
     return replace(camera, T_cam_lidar=turn @ camera.T_cam_lidar)
 
 
 def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
-    """Return the sum of image gradients at depth discontinuities, and the number in view."""
+    """Return the sum of image gradients at all depth discontinuities in view, and their number."""
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
     return _sum(lines, np.zeros(4)), sum(len(line.uv) for line in lines)
 
@@ -162,10 +165,10 @@ def score(camera: Camera, views: Sequence[View]) -> tuple[float, int]:
 def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -> bool:
     """Return True if an RGB image is clearly turned against the depth discontinuities of a sweep.
 
-    It is if a turn of up to 2.7 degrees scores better than the best turn within 0.3 degrees, by two
-    standard errors of the sum of their differences at the discontinuities, and stands out: where
-    discontinuities are few, the best of many turns is better by chance too. ``camera`` has its pose
-    at the exposure of the (H,W,3) image.
+    A turn of up to 2.7 degrees must score better than the best turn within 0.3 degrees, by two
+    standard errors of the sum of their differences at the discontinuities. The turn must also stand
+    out from all others: where discontinuities are few, the best of many turns is better by chance.
+    ``camera`` has its pose at the exposure of the (H,W,3) image.
     """
     view = View(silhouettes, *image_edges(image, camera.focal_px), np.zeros(6), 0.0)
     lines = _Lines.of(camera, view, np.zeros(4))
@@ -175,16 +178,17 @@ def is_off(camera: Camera, silhouettes: Silhouettes, image: NDArray[np.uint8]) -
     is_small = (np.abs(turns[:, :2]) < 1.5 * _STEP[0]).all(axis=1)
     small, large = (turns[mask][np.argmax(scores[mask])] for mask in (is_small, ~is_small))
     gain = np.diff(lines.strengths(np.stack([small, large])), axis=0)
-    rival_score = scores[_is_beside(turns, large)].max()
-    median = np.median(scores)
-    stands_out = rival_score - median < _AS_HIGH * (scores[~is_small].max() - median)
+    rival_score = scores[_is_far(turns, large)].max()
+    median_score = np.median(scores)
+    height = scores[~is_small].max() - median_score
+    stands_out = rival_score - median_score < _AS_HIGH * height
     return bool(stands_out and gain.sum() > _CLEARLY * np.sqrt((gain**2).sum()))
 
 
 def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
-    """Return the best-fitting offset of a camera to two or more views, without delay or with it.
+    """Return the offset of a camera's rotation and clock that fits two or more views best.
 
-    Among equal local maxima, the one that changes the fewest parameters is chosen.
+    Of equal maxima, the one of fewest changes is chosen. ``with_clock`` False keeps the clock.
     """
     free = np.array([True, True, True, with_clock])
     lines = [_Lines.of(camera, view, np.zeros(4)) for view in views]
@@ -197,60 +201,61 @@ def best_fit(camera: Camera, views: Sequence[View], with_clock: bool) -> Fit:
     usual = float(np.median(on_grid)) * thin
 
     # The best of the local maxima near some starts, and the best score far from it
-    starts = _starts(grid, on_grid, free)
-    maxima = [_climbed(lines, start, free) for start in starts]
-    best, others, are_equal = _simplest(lines, maxima, usual)
-    is_beside = _is_beside(grid, best)
-    rival = grid[is_beside][np.argmax(on_grid[is_beside])]
+    starts = _find_starts(grid, on_grid, free)
+    maxima = [_climb(lines, start, free) for start in starts]
+    best, others, are_equal = _choose_simplest(lines, maxima, usual)
+    is_far = _is_far(grid, best)
+    rival = grid[is_far][np.argmax(on_grid[is_far])]
     rival_score = _sum(lines, rival)
 
     # Projections are linear in the offset; they are linearised again at the best offset.
     lines = [_Lines.of(camera, view, best) for view in views]
-    correction = _climbed(lines, np.zeros(4), free)
-    error = _error(lines, correction, free)
+    correction = _climb(lines, np.zeros(4), free)
+    error = _find_error(lines, correction, free)
     best_score = _sum(lines, correction)
     return Fit(best + correction, error, best_score, rival_score, usual, others, are_equal)
 
 
-def _starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
+def _find_starts(grid: Float, on_grid: Float, free: Bool) -> list[Float]:
     """Return offsets (4,) to climb from: none, the best of each parameter, the best of all."""
     # on_grid (M,): score of each offset of the grid (M,4)
     starts = [np.zeros(4)]
     for axis in np.flatnonzero(free):
         rows = np.flatnonzero((np.delete(np.abs(grid), axis, axis=1) < 1e-9).all(axis=1))
         starts.append(grid[rows[np.argmax(on_grid[rows])]])
-    num = len(starts) + _NUM_STARTS - 1
+    num_starts = len(starts) + _NUM_STARTS - 1
     for row in np.argsort(-on_grid):
-        if len(starts) == num:
+        if len(starts) == num_starts:
             break
-        if all(_is_beside(grid[row], start) for start in starts):
+        if all(_is_far(grid[row], start) for start in starts):
             starts.append(grid[row])
     return starts
 
 
-def _simplest(
+def _choose_simplest(
     lines: Sequence[_Lines], maxima: Sequence[Float], usual: float
 ) -> tuple[Float, Float, Bool]:
     """Return the equally good maximum (4,) of fewest changes, then `Fit.others` and `are_equal`."""
     offsets = np.array(maxima)
-    scores = np.stack([line.scores(offsets) for line in lines], axis=1)
+    scores = np.stack([line.scores(offsets) for line in lines], axis=1)  # of each view
     total = scores.sum(axis=1)
     top = int(np.argmax(total))
-    worse = scores[top] - scores
-    error = np.sqrt(len(lines)) * worse.std(axis=1, ddof=1)
-    high = total - usual > _AS_HIGH * (total[top] - usual)
-    equal = high & (worse.sum(axis=1) <= _CLEARLY * error)
-    equal[top] = True
-    order = np.lexsort((-total, num_changed(offsets), ~equal))
+    deficit = scores[top] - scores
+    deficit_error = np.sqrt(len(lines)) * deficit.std(axis=1, ddof=1)  # of the sum over the views
+    is_high = total - usual > _AS_HIGH * (total[top] - usual)
+    is_equal = is_high & (deficit.sum(axis=1) <= _CLEARLY * deficit_error)
+    is_equal[top] = True
+    # Equal offsets first, then by number of changes, then by score
+    order = np.lexsort((-total, num_changed(offsets), ~is_equal))
     kept = [int(order[0])]
-    for row in order[high[order]]:
-        if all(_is_beside(offsets[row], offsets[kept_row]) for kept_row in kept):
+    for row in order[is_high[order]]:
+        if all(_is_far(offsets[row], offsets[kept_row]) for kept_row in kept):
             kept.append(int(row))
-    return offsets[kept[0]], offsets[kept[1:]], equal[kept[1:]]
+    return offsets[kept[0]], offsets[kept[1:]], is_equal[kept[1:]]
 
 
 def num_changed(offsets: Float) -> Any:
-    """Return the (M,) numbers of parameters that offsets (M,4) change by more than 3 blurs."""
+    """Return the number of parameters, (M,), that each offset (M,4) changes by over 3 blurs."""
     return (np.abs(offsets) > 3 * _BLURRED).sum(axis=-1)
 
 
@@ -275,17 +280,17 @@ class _Lines(NamedTuple):
     def of(camera: Camera, view: View, offset: Float) -> _Lines:
         """Project the depth discontinuities of a view, after an offset (4,) as in `Fit`."""
 
-        def project(more: Float) -> tuple[Float, Bool]:
-            seen_s = view.exposed_s + offset[3] + more[3]
-            T_then_lidar = poses.inverse(poses.exp(seen_s * view.twist))
-            T_cam_then = turned(turned(camera, offset), more).T_cam_lidar
-            return image_points(camera, poses.transform(T_cam_then @ T_then_lidar, points))
+        def project(added: Float) -> tuple[Float, Bool]:
+            exposed_s = view.exposed_s + offset[3] + added[3]
+            T_exposed_lidar = poses.inverse(poses.exp(exposed_s * view.twist))
+            T_cam_exposed = turned(turned(camera, offset), added).T_cam_lidar
+            return image_points(camera, poses.transform(T_cam_exposed @ T_exposed_lidar, points))
 
         points, is_level = view.silhouettes
-        inside = project(np.zeros(4))[1]
+        _, inside = project(np.zeros(4))
         points, is_level = points[inside], is_level[inside]
-        uv, slope = project(np.zeros(4))[0], np.zeros((len(points), 2, 4))
-        for axis, step in enumerate(0.2 * _BLURRED):
+        (uv, _), slope = project(np.zeros(4)), np.zeros((len(points), 2, 4))
+        for axis, step in enumerate(0.2 * _BLURRED):  # small against the blur of the edges
             ends = [project(sign * step * np.eye(4)[axis])[0] for sign in (1, -1)]
             slope[:, :, axis] = (ends[0] - ends[1]) / (2 * step)
         known = np.isfinite(slope).all(axis=(1, 2))
@@ -312,16 +317,16 @@ class _Lines(NamedTuple):
 
 
 def _sum(lines: Sequence[_Lines], offset: Float) -> float:
-    """Return the score of an offset (4,) over all views."""
+    """Return the score of an offset (4,), summed over all views."""
     return float(sum(line.scores(offset[None])[0] for line in lines))
 
 
-def _is_beside(offsets: Float, reference: Float) -> Any:
+def _is_far(offsets: Float, reference: Float) -> Any:
     """Return (M,) True for offsets (M,4) over 1 degree (pitch, yaw) or 0.1 s from the reference."""
     return (np.abs(offsets - reference)[..., [0, 1, 3]] > (1.0, 1.0, 0.1)).any(axis=-1)
 
 
-def _climbed(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
+def _climb(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
     """Return the offset (4,) of the local maximum of the score near a start."""
     steps = np.concatenate([np.eye(4)[free], -np.eye(4)[free]])
     best = _sum(lines, offset)
@@ -329,30 +334,33 @@ def _climbed(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
         while True:
             around = offset + steps * _BLURRED / 2**halving
             scores = np.sum([line.scores(around) for line in lines], axis=0)
-            if scores.max() <= best or np.abs(offset[0]) > 2 * _REACH[0]:
+            if scores.max() <= best or np.abs(offset[0]) > 2 * _REACH[0]:  # summit, or lost
                 break
             offset, best = around[int(np.argmax(scores))], float(scores.max())
     return offset
 
 
-def _error(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
+def _find_error(lines: Sequence[_Lines], offset: Float, free: Bool) -> Float:
     """Return (4,) the standard error of the best offset, 0 for parameters that are not fitted."""
     axes = np.flatnonzero(free)
     steps = np.eye(4)[axes] * _BLURRED
+    # Scores at the offset, one step ahead and behind along each axis, and at the corners of pairs
     num, pairs = len(axes), [(i, j) for i in range(len(axes)) for j in range(i)]
     corners = [s * steps[i] + t * steps[j] for i, j in pairs for s in (1, -1) for t in (1, -1)]
     offsets = offset + np.concatenate([np.zeros((1, 4)), steps, -steps, np.array(corners)])
     scores = np.stack([line.scores(offsets) for line in lines])
-    slope = 0.5 * (scores[:, 1 : num + 1] - scores[:, num + 1 : 2 * num + 1])
+    _, ahead, behind, _ = np.split(scores, [1, num + 1, 2 * num + 1], axis=1)
+    slope = 0.5 * (ahead - behind)
     total = scores.sum(axis=0)
-    curvature = np.diag(total[1 : num + 1] + total[num + 1 : 2 * num + 1] - 2 * total[0])
-    for row, (i, j) in enumerate(pairs):
-        # Scores at the corners ++, +-, -+ and -- of the axes i and j
-        pp, pm, mp, mm = total[2 * num + 1 + 4 * row :][:4]
+    centre, ahead, behind, at_corners = np.split(total, [1, num + 1, 2 * num + 1])
+    curvature = np.diag(ahead + behind - 2 * centre)
+    for (i, j), (pp, pm, mp, mm) in zip(pairs, at_corners.reshape(-1, 4), strict=True):
+        # Mixed derivative from the corners ++, +-, -+ and -- of the axes i and j
         curvature[i, j] = curvature[j, i] = 0.25 * (pp - pm - mp + mm)
     error = np.zeros(4)
     error[axes] = np.inf
-    if np.linalg.eigvalsh(curvature).max() < 0:
+    if np.linalg.eigvalsh(curvature).max() < 0:  # a maximum, which the views determine
+        # Sandwich estimate: curvature⁻¹ (Σ slope slopeᵀ over the views) curvature⁻¹
         slope = slope - slope.mean(axis=0)
         spread = np.linalg.solve(curvature, slope.T)
         error[axes] = np.sqrt(np.einsum("av,av->a", spread, spread)) * _BLURRED[axes]

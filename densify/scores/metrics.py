@@ -66,11 +66,17 @@ def depth_errors(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> DepthErrors:
-    """Return the errors of depths over the pixels with ground truth, or those of a mask.
+    """Return the errors of depths where both the depth and its ground truth exist.
 
-    Both are (H,W) maps or (N,) lists of depths, camera z in metres, 0 for none. A depth z is an
-    outlier if its disparity ``focal_px * baseline_m / z`` differs by more than 3 px *and* by more
-    than 5 % from the true disparity.
+    A depth z is an outlier if its disparity ``focal_px * baseline_m / z`` differs by more than 3 px
+    *and* by more than 5 % from the true disparity.
+
+    Args:
+        predicted_m: (H,W) map or (N,) list of depths, camera z in metres, 0 for none.
+        truth_m: True depths in the same form. Coverage counts all pixels that have one.
+        mask: True for the pixels to score, in the same shape; None for all.
+        focal_px: Focal length of the camera.
+        baseline_m: Stereo baseline that turns depth into disparity.
     """
     has_truth = truth_m > 0 if mask is None else (truth_m > 0) & mask
     is_compared = has_truth & (predicted_m > 0)
@@ -79,7 +85,7 @@ def depth_errors(
     z = predicted_m[is_compared].astype(float)
     t = truth_m[is_compared].astype(float)
     error_m = np.abs(z - t)
-    error_per_km = np.abs(1000 / z - 1000 / t)
+    error_per_km = np.abs(1000 / z - 1000 / t)  # difference of inverse depths
     ratio = np.maximum(z / t, t / z)
     return DepthErrors(
         num_pixels=num_pixels,
@@ -107,8 +113,8 @@ def precision_density(
 
     Each dictionary has ``min_confidence``, and for ``measured`` and ``filled`` depth:
     ``density_*``, share of the pixels that keep a depth; ``outliers_*``, share of outliers among
-    those with a true depth ``truth_m``; ``expected_*``, share of outliers that the confidence of
-    the kept pixels promises. The latter two are None without such pixels.
+    the kept pixels with a true depth (``truth_m``); ``expected_*``, share of outliers that the
+    confidence of the kept pixels promises. The latter two are None without such pixels.
     """
     curve = []
     for min_confidence in _LEAST_CONFIDENCES:
@@ -133,11 +139,11 @@ def errors_by_part(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> dict[str, DepthErrors]:
-    """Return `depth_errors` of parts of the pixels (H,W), by name of the part.
+    """Return the errors of a depth map for parts of its pixels, by name of the part.
 
     The parts are ``all`` pixels, ranges of true depth (``0-10 m`` … ``over 80 m``), `depth_edges`
     (``edge``), other pixels (``not edge``) and, given the mask ``moving``, ``moving`` and
-    ``static`` pixels. Depths are metres, 0 for none.
+    ``static`` pixels. Maps are (H,W), depths are metres, 0 for none.
     """
     known = truth_m > 0
     z, t = predicted_m[known], truth_m[known]
@@ -156,10 +162,10 @@ def errors_by_part(
 
 
 def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_BASELINE_M) -> Bool:
-    """Return (H,W) True at pixels with a true depth in metres close to a depth discontinuity.
+    """Return a mask (H,W) of the pixels with a true depth (metres) near a depth discontinuity.
 
     Within 3 px of such a pixel, another true depth would be an outlier at this pixel. Level ground
-    is no discontinuity: for a camera 1.65 m above it, disparity grows by 0.54/1.65 px per row.
+    is no discontinuity: for a camera 1.65 m above ground, disparity grows by 0.54/1.65 px per row.
     """
     known = truth_m > 0
     disparity_px = np.zeros(truth_m.shape)
@@ -175,7 +181,7 @@ def depth_edges(truth_m: Float32, *, focal_px: float, baseline_m: float = KITTI_
 
 
 def mean_errors(images: Sequence[DepthErrors]) -> DepthErrors:
-    """Return the mean of each error over images where it is defined, and the sum of the counts."""
+    """Return the mean of each error over the images with this error, and the sums of the counts."""
     means: dict[str, Any] = {}
     for field in fields(DepthErrors):
         values = [value for image in images if (value := getattr(image, field.name)) is not None]
@@ -192,9 +198,10 @@ def image_density(depth_m: Float32) -> float:
 def depth_scores(
     depth: DepthMap, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return `depth_errors` as ``scores["measured"|"filled"]["all"|"moving"|"static"]``.
+    """Return the errors of a depth map: ``measured`` or ``filled`` -> pixels -> name -> error.
 
-    ``truth_depth_m`` (H,W) is in metres, 0 for none; ``moving_mask`` (H,W) is True if moving.
+    Pixels are ``all``, ``moving`` or ``static``, names those of `DepthErrors`. ``truth_depth_m`` is
+    (H,W) metres, 0 for none. ``moving_mask`` (H,W) is True at moving objects.
     """
     return {
         product: scores_by_motion(image, truth_depth_m, moving_mask, camera)
@@ -205,7 +212,10 @@ def depth_scores(
 def scores_by_motion(
     depth_m: Float32, truth_depth_m: Float32, moving_mask: Bool, camera: Camera
 ) -> dict[str, dict[str, Any]]:
-    """Return `depth_errors` of depths (H,W), metres, as ``scores["all"|"moving"|"static"]``."""
+    """Return ``all``, ``moving`` or ``static`` pixels -> name in `DepthErrors` -> error of a map.
+
+    Both depths are (H,W) metres, 0 for none. ``moving_mask`` (H,W) is True at moving objects.
+    """
     masks = {"all": None, "moving": moving_mask, "static": ~moving_mask}
     return {
         group: asdict(depth_errors(depth_m, truth_depth_m, mask, focal_px=camera.focal_px))
@@ -214,16 +224,16 @@ def scores_by_motion(
 
 
 def shares_by_motion(mask: Bool, moving: Bool) -> dict[str, float | None]:
-    """Return the share of a mask (N,) among ``all``, ``moving`` and ``static`` rows, else None."""
+    """Return the shares of True in ``mask`` (N,) of ``all``, ``moving``, ``static``; else None."""
     parts = {"all": mask, "moving": mask[moving], "static": mask[~moving]}
     return {name: mean_or_none(part) for name, part in parts.items()}
 
 
 def outlier_probability(confidence: Float | Float32) -> Float:
-    """Return the probability, in the shape of ``confidence``, of an outlier by KITTI's rule.
+    """Return the probability that a pixel of some confidence is an outlier by KITTI's rule.
 
-    It is ``10 ** (-5 * confidence)``. A pixel value v above 0 of a confidence PNG means the
-    confidence ``(v - 1) / 254``.
+    It is ``10 ** (-5 * confidence)``, in the shape of ``confidence``. A pixel value v above 0 of a
+    confidence PNG means the confidence ``(v - 1) / 254``.
     """
     return 10.0 ** (-DECADES * np.asarray(confidence, np.float64))
 
@@ -234,7 +244,7 @@ def is_outlier_depth(
     focal_px: float,
     baseline_m: float = KITTI_BASELINE_M,
 ) -> Bool:
-    """Return (N,) True where a depth (N,) above 0 is an outlier by KITTI's rule."""
+    """Return a mask (N,), True where a depth (N,) above 0 is an outlier by KITTI's rule."""
     disparity_m_px = focal_px * baseline_m
     predicted_px = disparity_m_px / predicted_m.astype(np.float64)
     return _is_outlier(predicted_px, disparity_m_px / truth_m.astype(np.float64))
@@ -263,7 +273,7 @@ _OFF_M, _OFF_PER_M, _OFF_DEG = 0.03, 0.01, 0.3
 def window_pose_errors(
     stretch: Stretch, key: int, T_world_lidar: Callable[[int], Float]
 ) -> tuple[float, float]:
-    """Return the root mean square errors (m, degrees) of a window's poses relative to the key's.
+    """Return the root mean square errors of a window's poses relative to the key's: m, degrees.
 
     ``T_world_lidar`` returns the true (4,4) pose of a frame.
     """
@@ -303,18 +313,20 @@ class RecordedError(NamedTuple):
 def main_error(
     recorded: Sequence[Float], odometry: Sequence[Float], duration_s: float
 ) -> tuple[str, str]:
-    """Return a clause about the main error of recorded motions (4,4), and one about its correction.
+    """Return two clauses: the main error of recorded motions against odometry, and its correction.
 
-    The error is a scale, or a drift over ``duration_s``. Without correction, that clause is "".
+    The error is a scale, or a drift over ``duration_s`` seconds. Without a known correction the
+    second clause is "". Motions are (4,4), each over one stretch of sweeps.
     """
     recorded_m, odometry_m = (
         np.array([T[:3, 3] for T in motions]) for motions in (recorded, odometry)
     )
     off_m, way_m = (recorded_m - odometry_m).mean(axis=0), odometry_m.mean(axis=0)
-    # Errors in different directions have no common cause.
+    # Errors in different directions have no common cause: then their mean is short.
     if np.linalg.norm(off_m) < 0.5 * np.linalg.norm(recorded_m - odometry_m, axis=1).mean():
         mistake = "; no usual mistake explains it (another frame than the points', another clock,"
         return f"{mistake} or noise)", ""
+    # Error along the way, as a share of the way: a scale if it makes up most of the error
     longer = float(off_m @ way_m / (way_m @ way_m))
     if abs(longer) * np.linalg.norm(way_m) > 0.7 * np.linalg.norm(off_m):
         sense = "long" if longer > 0 else "short"
@@ -337,7 +349,7 @@ _EDGES_M = np.linspace(0, 2.0, 51)  # lower edges of the buckets; the first hold
 
 
 def end_point_errors(estimated: Float, true: Float) -> Float:
-    """Return the (N,) end-point errors in metres, |estimated - true| of (N,3) flows."""
+    """Return the end-point errors (N,), |estimated - true| in metres, of flows (N,3)."""
     return np.linalg.norm(np.asarray(estimated, np.float64) - np.asarray(true, np.float64), axis=1)
 
 
@@ -348,7 +360,7 @@ def end_point_error(estimated: Float, true: Float, mask: Bool | None = None) -> 
 
 
 def accuracy(estimated: Float, true: Float, limit: float) -> float:
-    """Return the share of points with an end-point error below a limit.
+    """Return the share of points whose end-point error is below a limit; flows (N,3) are metres.
 
     The limit is ``limit`` metres or, if larger, ``limit`` times the length of the true flow.
     """
@@ -357,9 +369,9 @@ def accuracy(estimated: Float, true: Float, limit: float) -> float:
 
 
 def angle_error_rad(estimated: Float, true: Float) -> float:
-    """Return the mean angle from true to estimated flow, where true flow is not 0.
+    """Return the mean angle in radians between estimated and true flows (N,3).
 
-    An estimate of 0 counts as a right angle.
+    Points whose true flow is 0 do not count. An estimate of 0 counts as a right angle.
     """
     length_m = np.linalg.norm(true, axis=1)
     flow, truth, length_m = (values[length_m > 0] for values in (estimated, true, length_m))
@@ -439,7 +451,7 @@ _GHOST_MARGIN_M, _GHOST_MARGIN_FRACTION, _MIN_FILLED = 0.5, 0.02, 6
 
 
 def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
-    """Return (M,) True for ghosts, and (M,) True for points that the key sweep cannot judge.
+    """Return two masks (M,) of a cloud: ghosts, and points that the key sweep cannot judge.
 
     At a ghost's position, all returns of the key sweep in its cell and the eight around it, at
     least six, are farther by more than max(0.5 m, 2 % of its range). Dark paint and glass hide
@@ -457,16 +469,16 @@ def ghosts(cloud: Cloud, key_image: RangeImage, key: int) -> tuple[Bool, Bool]:
 
 
 def ghost_rate(cloud: Cloud, key_image: RangeImage, key: int) -> float | None:
-    """Return the share of `ghosts` among the window's points of other sweeps, None without any."""
+    """Return the share of `ghosts` among the window's points of other sweeps; None without any."""
     return mean_or_none(ghosts(cloud, key_image, key)[0][_others(cloud, key)])
 
 
 def ghost_scores(cloud: Cloud, key_image: RangeImage, key: int) -> dict[str, Any]:
     """Return the shares of `ghosts` among the ``num_points`` points of the window's other sweeps.
 
-    They are for ``all``, ``moving`` and ``static`` points, by frames (``by_distance["3"]``) and
-    seconds (``by_seconds["0.30"]``) from the key sweep. ``unjudged`` has the shares that it cannot
-    judge.
+    The shares are of ``all``, ``moving`` and ``static`` points, and of points by frames
+    (``by_distance["3"]``) and by seconds (``by_seconds["0.30"]``) from the key sweep. ``unjudged``
+    has the shares of points that the key sweep cannot judge.
     """
     rows = np.flatnonzero(_others(cloud, key))
     ghost, unjudged = (mask[rows] for mask in ghosts(cloud, key_image, key))
@@ -489,5 +501,5 @@ def _others(cloud: Cloud, key: int) -> Bool:
 
 def _rates(ghost: Bool, group: NDArray[np.integer]) -> dict[int, float]:
     """Return the share of ghosts in each group number (N,) that has points, ascending."""
-    num, num_ghosts = np.bincount(group), np.bincount(group, ghost)
-    return {g: float(num_ghosts[g] / num[g]) for g in np.flatnonzero(num).tolist()}
+    num_points, num_ghosts = np.bincount(group), np.bincount(group, ghost)
+    return {g: float(num_ghosts[g] / num_points[g]) for g in np.flatnonzero(num_points).tolist()}
