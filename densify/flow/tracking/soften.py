@@ -129,6 +129,8 @@ def _may_bend(snapshots: tuple[Snapshot, ...]) -> bool:
 
 def _held_out_errors(snapshots: tuple[Snapshot, ...]) -> Float:
     """Return the mean squared distances (m²) of held-out snapshots from their predictions."""
+    # Row i belongs to snapshot i + 1: the first and the last snapshot cannot be predicted. Column 0
+    # is the rigid object, column k has alpha k - 1.
     squared_m2 = np.zeros((len(snapshots) - 2, 1 + len(_ALPHAS)))
     # Snapshots with even index predict those with odd index, and the other way round.
     for parity in (0, 1):

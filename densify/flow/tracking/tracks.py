@@ -101,7 +101,7 @@ class _Search:
             members = cluster[is_available]
             if len(members) < MIN_POINTS:
                 continue
-            # A track starts only at velocities that explain free-space violations.
+            # Velocities start a track only if they lower the number of violations, if any.
             proposed = [self._likely_velocity(members, n), *self._nearby_velocities(members, n)]
             velocities = [velocity for velocity in proposed if self._may_move(members, n, velocity)]
             if not velocities:
