@@ -31,14 +31,14 @@ class Energy(NamedTuple):
 def energy(
     flow: Tensor, source: Tensor, target: Tensor, laplacian: csr_array, alpha: float
 ) -> Energy:
-    """Return the energy E(F) of a flow, differentiable with respect to the flow.
+    """Return the energy E(F) of a flow in m², differentiable with respect to the flow.
 
     The energy is::
 
         E(F)   = E_d(F) + alpha tr(Fᵀ L F)
         E_d(F) = Σ_p min_q |p + f_p - q|² + Σ_q min_p |p + f_p - q|²
 
-    Nearest neighbours are found on the CPU without gradient; the distances to them carry it. The
+    Nearest neighbours are found on the CPU, without gradient. Only the distances carry it. The
     gradient is exact wherever no two neighbours tie. The energy is a sum over points, not a mean.
 
     Args:
@@ -74,7 +74,7 @@ def energy(
 
 @contextmanager
 def on_one_thread() -> Iterator[None]:
-    """Run torch on one thread inside the block: its sums depend on the thread count."""
+    """Run torch on one thread inside the ``with`` block: sums depend on the number of threads."""
     num_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -84,7 +84,9 @@ def on_one_thread() -> Iterator[None]:
 
 
 class _QuadraticForm(torch.autograd.Function):
-    """Function tr(FᵀLF) for a symmetric sparse L; one matrix product serves value and gradient."""
+    """Function tr(FᵀLF) of a flow F, for a symmetric sparse matrix L."""
+
+    # The gradient is 2 L F, hence one product L F serves the value and the gradient.
 
     @staticmethod
     def forward(ctx: Any, flow: Tensor, laplacian: csr_array) -> Tensor:

@@ -25,7 +25,7 @@ from densify.geometry.types import Float, FlowField, Int, Motion, Stretch
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Input of a scene flow engine: registered sweeps in one world, their ground and free space."""
+    """Input of a scene flow engine: registered sweeps in one world, with ground and free space."""
 
     stretch: Stretch  # consecutive registered sweeps
     ground: HeightMap  # height map of the ground under all sweeps
@@ -39,7 +39,7 @@ class Scene:
 
     @cached_property
     def obstacles(self) -> tuple[Obstacles, ...]:
-        """The points of each sweep above the ground, and which of them may move."""
+        """The points above the ground of each sweep, with a mark at points that may move."""
         return find_candidates(self.stretch, self.space, self.ground)
 
     def is_asked(self, i: int) -> bool:
@@ -53,7 +53,7 @@ class SharedMotion(Motion, Protocol):
     # A dataclass, which the disk cache stores without the points of its sweeps
 
     def with_stretch(self, stretch: Stretch) -> SharedMotion:
-        """Return the same motion on another copy of its stretch; that on disk has no points."""
+        """Return the same motion on another copy of its stretch; a cached copy has no points."""
         ...
 
 
@@ -77,8 +77,10 @@ class EngineModule(Protocol):
 def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> Motion:
     """Return the motion of all points in a scene, by one scene flow engine.
 
-    It is the engine ``spec``, as ``NAME`` or ``NAME:ARGUMENT``, or that of the settings. InputError
-    is raised for an unknown name, or an argument that the engine rejects.
+    The engine ``spec`` is ``NAME`` or ``NAME:ARGUMENT``; None takes that of the settings.
+
+    Raises:
+        InputError: No engine has this name, or the engine rejects the argument.
     """
     plugin, argument = engine(spec or settings.flow.engine)
     module = cast(EngineModule, plugin.load_module())
@@ -86,7 +88,7 @@ def estimate_motion(scene: Scene, settings: Config, spec: str | None = None) -> 
 
 
 def check_engine(spec: str) -> None:
-    """Import an engine ``NAME[:ARGUMENT]`` and check its argument; InputError if it is bad."""
+    """Import an engine ``NAME[:ARGUMENT]``, and raise InputError for a bad name or argument."""
     plugin, argument = engine(spec)
     check = getattr(plugin.load_module(), "check_argument", None)
     if check is not None:
@@ -112,11 +114,11 @@ class ChainedMotion:
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
-        It excludes ego-motion, and is in the lidar frame of ``frame``. At each sweep on the way,
-        points of an object take its rigid motion plus the mean deviation of the nearest three
-        points. Moving points without an object take the mean flow of the nearest three. A point is
-        lost if its object has no points in the next sweep, or, without an object, if the nearest
-        such point is more than 0.5 m away.
+        The flow excludes ego-motion, and is in the lidar frame of ``frame``. At each sweep on the
+        way, points of an object continue with its rigid motion, plus the mean non-rigid
+        displacement of the nearest three points of the object. Other moving points continue with
+        the mean flow of the nearest three of their kind. A point is lost if its object has no
+        points in the next sweep, or, without an object, if none of its kind is within 0.5 m.
 
         The flow to ``frame`` itself is 0, with the labels of the step to a neighbouring sweep.
         """
@@ -130,7 +132,7 @@ class ChainedMotion:
         return replace(step, displacement=np.zeros_like(step.displacement))
 
     def _flow(self, i: int, j: int) -> FlowField:
-        """Return the flow of sweep index i to another sweep index j; each pair is cached."""
+        """Return the flow of the sweep with index i to that with index j; each pair is cached."""
         if (i, j) not in self._flows:
             neighbour = i + (1 if j > i else -1)  # next to sweep i, towards j
             if neighbour == j:
@@ -143,15 +145,15 @@ class ChainedMotion:
         return self._flows[i, j]
 
     def _follow(self, i: int, neighbour: int, onward: FlowField) -> FlowField:
-        """Chain the flow of sweep i to its neighbour with ``onward``, from there to the target."""
+        """Chain the flow of sweep i to its neighbour with ``onward``, the neighbour's flow."""
         step = self._flow(i, neighbour)
         sweep, next_sweep = self.stretch.sweeps[i], self.stretch.sweeps[neighbour]
         T_next_lidar = self.stretch.T_target_source(next_sweep.frame, sweep.frame)
         R_next_lidar = T_next_lidar[:3, :3]
         displacement, lost = step.displacement.copy(), step.lost.copy()
         velocity_m_s = np.zeros_like(displacement)
-        # (M,3) points of the neighbour at its reference time. The total flow is the motion to this
-        # time plus the displacement to the target.
+        # (M,3) points of the neighbour at its reference time. The total flow is the motion from the
+        # firing time to the reference time, plus the displacement from this time to the target.
         next_points = next_sweep.sweep.points + onward.total - onward.displacement
         for instance in np.unique(step.instance[step.moving]):
             rows = np.flatnonzero(step.moving & (step.instance == instance))
@@ -159,37 +161,44 @@ class ChainedMotion:
             if not len(next_rows):
                 lost[rows] = True
                 continue
-            # Where the step brings the points of sweep i, and the object's points around there
+            # Positions to which the step brings the points, and members of their instance there
             arrived = poses.transform(T_next_lidar, sweep.sweep.points[rows] + step.total[rows])
             members = next_points[next_rows]
             gap_m, nearest = nearest_k(tree_of(members), arrived, 3)
             weight = 1 / (gap_m + 1e-3)  # 1 mm avoids a division by 0
             weight /= weight.sum(axis=1, keepdims=True)
+            member_flow = onward.displacement[next_rows]
             if instance >= 0:
-                # A point moves on with the rigid motion of its object, plus the mean deviation of
-                # the points around it from this motion.
-                member_targets = members + onward.displacement[next_rows]
-                T = _object_motion(members, member_targets)
-                rigid_flow = poses.transform(T, arrived) - arrived
-                deviation = member_targets - poses.transform(T, members)
+                onward_flow = _flow_with_object(arrived, members, member_flow, nearest, weight)
             else:
-                # Instance -1 holds moving points without an object. They need not move alike, so a
-                # point moves on with the mean of the points around it.
-                rigid_flow = np.zeros_like(arrived)
-                deviation = onward.displacement[next_rows]
+                # Instance -1 holds moving points without an object. They need not move alike.
+                onward_flow = _mean(member_flow, nearest, weight)
                 lost[rows[gap_m[:, 0] > _MAX_GAP_M]] = True
             # From the axes of the neighbour to those of sweep i: row vectors times R turn back.
-            displacement[rows] += (rigid_flow + _mean(deviation, nearest, weight)) @ R_next_lidar
+            displacement[rows] += onward_flow @ R_next_lidar
             if onward.velocity_m_s is not None:
                 next_velocity_m_s = onward.velocity_m_s[next_rows]
                 velocity_m_s[rows] = _mean(next_velocity_m_s, nearest, weight) @ R_next_lidar
         return replace(step, displacement=displacement, lost=lost, velocity_m_s=velocity_m_s)
 
 
+def _flow_with_object(
+    positions: Float, members: Float, member_flow: Float, nearest: Int, weight: Float
+) -> Float:
+    """Return the (N,3) flow at positions (N,3) on an object with flow at its members (M,3).
+
+    ``nearest`` (N,k) are the rows of the members around each position, with ``weight`` (N,k).
+    """
+    member_targets = members + member_flow
+    T = _object_motion(members, member_targets)
+    non_rigid = member_targets - poses.transform(T, members)
+    return poses.transform(T, positions) - positions + _mean(non_rigid, nearest, weight)
+
+
 def _object_motion(source: Float, target: Float) -> Float:
     """Return the (4,4) rigid motion that best moves points (N,3) to target positions (N,3)."""
     if np.linalg.matrix_rank(source - source.mean(axis=0), tol=_LINE_M) < 2:
-        # fewer than three points, or points on a line: a pure translation
+        # Fewer than three points, or points on a line, do not determine a rotation.
         T = np.eye(4)
         T[:3, 3] = (target - source).mean(axis=0)
         return T

@@ -16,7 +16,7 @@ from densify.geometry.types import Float
 
 
 def checked_cloud(values: ArrayLike, name: str) -> Float:
-    """Return a copy of a cloud, (n,3) numbers, as float64 metres; ``name`` is for messages.
+    """Return a copy of a cloud as (n,3) float64 metres; ``name`` is for messages.
 
     Raises:
         InputError: The values are no numbers, have another shape, are empty or not finite.
@@ -46,28 +46,29 @@ def knn_graph(points: Float, num_neighbors: int, within_m: float = np.inf) -> cs
 
     Args:
         points: (n,3) metres.
-        num_neighbors: k, itself excluded. At most n - 1 are used. A larger k couples the flow of
-            points farther apart.
+        num_neighbors: Number k of neighbours, without the point itself. At most n - 1 are used. A
+            larger k couples the flow of points farther apart.
         within_m: Greatest distance of a neighbour.
 
     Raises:
-        InputError: k is below 1, or the points are no cloud, see `checked_cloud`.
+        InputError: k is below 1, or the points have another shape, are empty or not finite.
     """
     if num_neighbors < 1:
         raise InputError(f"num_neighbors: got {num_neighbors}, expected at least 1")
     points = checked_cloud(points, "points")
-    num = len(points)
-    num_nearest = min(num_neighbors, num - 1) + 1  # with the point itself
+    num_points = len(points)
+    num_nearest = min(num_neighbors, num_points - 1) + 1  # with the point itself
     distance_m, neighbour = cKDTree(points).query(
         points, np.arange(1, num_nearest + 1), distance_upper_bound=within_m
     )
-    row = np.repeat(np.arange(num), num_nearest)
+    row = np.repeat(np.arange(num_points), num_nearest)
     column = np.ravel(neighbour)  # n for a neighbour that is too far away
     # With more than k duplicates, the point itself may be missing among the nearest.
-    is_edge = (column != row) & (column < num)
-    weight = np.exp(-(np.ravel(distance_m)[is_edge] ** 2))
-    directed = csr_array((weight, (row[is_edge], column[is_edge])), shape=(num, num))
-    weights = csr_array(directed.maximum(directed.T) + eye_array(num))
+    is_edge = (column != row) & (column < num_points)
+    edge_weight = np.exp(-(np.ravel(distance_m)[is_edge] ** 2))
+    edges = row[is_edge], column[is_edge]
+    directed = csr_array((edge_weight, edges), shape=(num_points, num_points))
+    weights = csr_array(directed.maximum(directed.T) + eye_array(num_points))
     weights.sort_indices()
     return weights
 
@@ -75,8 +76,8 @@ def knn_graph(points: Float, num_neighbors: int, within_m: float = np.inf) -> cs
 def laplacian(weights: csr_array) -> csr_array:
     """Return the graph Laplacian ``L = D^-1/2 (D - W) D^-1/2``.
 
-    L is (n,n) symmetric, positive semi-definite float64. D holds the row sums of the (n,n)
-    ``weights`` W of `knn_graph`, with ``W_ii = 1`` as in the paper. The null space of L is
+    L is (n,n) symmetric, positive semi-definite float64. D is diagonal, with the row sums of the
+    (n,n) ``weights`` W, whose diagonal is 1 as in the paper. The null space of L is
     ``D^1/2 · 1``: constant flow costs energy where density changes.
     """
     degree = weights.sum(axis=1)

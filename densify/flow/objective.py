@@ -31,8 +31,8 @@ from densify.geometry.types import Float, FlowField, Motion
 
 _ADAM_STEPS = 1500  # 200 usually reach the lowest energy
 _FIRST_ALPHA = 1000.0  # whole surfaces move together at this alpha
-_LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers the energy by less (share)
-_MAX_ALTERNATIONS, _MAX_LAST_ALTERNATIONS = 4, 100  # per level before the last, on the last
+_LEVEL_TOLERANCE = 2e-3  # a level ends when an alternation lowers the energy by a smaller share
+_MAX_ALTERNATIONS, _MAX_LAST_ALTERNATIONS = 4, 100  # of each level before the last, of the last
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,10 @@ def solve(
     settings: ObjectiveSettings | None = None,
     initial: ArrayLike | None = None,
 ) -> Solution:
-    """Return the smooth flow that moves ``source`` onto ``target``, a local minimum.
+    """Return the smooth flow that moves ``source`` onto ``target``.
 
-    All is computed in float64. The same input gives the same bytes on the same CPU.
+    The flow is a local minimum of the objective, computed in float64. The same input gives the same
+    bytes on the same CPU.
 
     Args:
         source: (n,3) metres.
@@ -81,6 +82,7 @@ def solve(
     if settings.solver == "adam":
         return _solve_by_adam(points, target_points, L, start, settings.alpha)
     problem = _Problem(points, target_points, cKDTree(target_points), L, settings.alpha)
+    # A given flow needs no large alphas, which would move whole surfaces again.
     first_alpha = settings.alpha if initial is not None else _FIRST_ALPHA
     return _solve_by_pcg(problem, start, _descending_alphas(first_alpha, settings.alpha))
 
@@ -88,7 +90,7 @@ def solve(
 def _solve_by_adam(
     source: Float, target: Float, L: csr_array, start: Float, alpha: float
 ) -> Solution:
-    """Return the solution by Adam, the published protocol, keeping the best flow of all steps."""
+    """Return the flow of least energy among all steps of Adam, the published protocol."""
     import torch
 
     from densify.flow.energy import energy, on_one_thread
@@ -98,17 +100,17 @@ def _solve_by_adam(
         points = torch.from_numpy(source)
         target_points = torch.from_numpy(target)
         optimizer = torch.optim.Adam([flow], lr=0.1)  # metres, as published
-        value = energy(flow, points, target_points, L, alpha)
-        best_flow, best = flow.detach().clone(), value
-        energies = [value.total.item()]
+        current = energy(flow, points, target_points, L, alpha)
+        best_flow, best = flow.detach().clone(), current
+        energies = [current.total.item()]
         for _ in range(_ADAM_STEPS):
             optimizer.zero_grad()
-            value.total.backward()
+            current.total.backward()
             optimizer.step()
-            value = energy(flow, points, target_points, L, alpha)
-            if value.total.item() < best.total.item():
-                best_flow, best = flow.detach().clone(), value
-            energies.append(value.total.item())
+            current = energy(flow, points, target_points, L, alpha)
+            if current.total.item() < best.total.item():
+                best_flow, best = flow.detach().clone(), current
+            energies.append(current.total.item())
     terms = (best.total.item(), best.data.item(), best.smoothness.item())
     return Solution(best_flow.numpy(), *terms, tuple(energies))
 
@@ -117,6 +119,7 @@ class _Value:
     """The energy of a flow, with the matches that give its gradient."""
 
     def __init__(self, problem: _Problem, flow: Float) -> None:
+        """Match the clouds under a flow (n,3), and compute the energy."""
         moved = problem.source + flow
         forward_m, to_target = problem.target_tree.query(moved)
         backward_m, to_source = cKDTree(moved).query(problem.target)
@@ -134,22 +137,22 @@ class _Value:
         self.num_matches = 1.0 + np.bincount(to_source, minlength=len(moved))
 
     def at(self, alpha: float) -> float:
-        """Return the energy at another alpha."""
+        """Return the energy (m²) of the same flow with another alpha."""
         return self.data + alpha * self.smoothness
 
 
 class _Problem(NamedTuple):
     """A pair of clouds relative to the mean of the source, with the Laplacian and alpha."""
 
-    source: Float
-    target: Float
-    target_tree: cKDTree
-    laplacian: csr_array
-    alpha: float
+    source: Float  # (n,3) metres
+    target: Float  # (m,3) metres
+    target_tree: cKDTree  # search tree of the target
+    laplacian: csr_array  # (n,n) Laplacian of the source's graph
+    alpha: float  # weight of smoothness
 
 
 def _solve_by_pcg(problem: _Problem, start: Float, levels: list[float]) -> Solution:
-    """Return the solution by majorisation and minimisation, over levels of descending alpha."""
+    """Return the flow by majorisation and minimisation, over ``levels`` of descending alpha."""
     # At large alphas whole surfaces move together. At a small alpha from the start, points would
     # stay with their first neighbours.
     value = _Value(problem, start)
@@ -169,7 +172,8 @@ def _solve_by_pcg(problem: _Problem, start: Float, levels: list[float]) -> Solut
 
 def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
     """Return the (n,3) step X of the flow that roughly minimises the quadratic bound."""
-    # (diag(num_matches) + alpha L) X = -gradient / 2, with a Jacobi preconditioner
+    # With C = diag(num_matches) the step solves (C + alpha L) X = -gradient / 2. All three columns
+    # are one vector for the solver, which has a Jacobi preconditioner.
     shape = problem.source.shape
     diagonal = value.num_matches[:, None]
     inverse = 1.0 / (diagonal + alpha * problem.laplacian.diagonal()[:, None])
@@ -193,14 +197,14 @@ def _step(problem: _Problem, value: _Value, alpha: float) -> Float:
     return step.reshape(shape)
 
 
-def _descending_alphas(first: float, alpha: float) -> list[float]:
-    """Return alphas from ``first`` down to ``alpha``, in equal factors of at most 10^(2/3)."""
-    lowest_alpha = max(alpha, 0.1)  # the last level before alpha = 0
-    if first <= lowest_alpha:
+def _descending_alphas(first_alpha: float, alpha: float) -> list[float]:
+    """Return alphas from ``first_alpha`` to ``alpha``, in equal factors of at most 10^(2/3)."""
+    lowest_alpha = max(alpha, 0.1)  # no factor leads to alpha = 0
+    if first_alpha <= lowest_alpha:
         return [alpha]
     # Without the 1e-9, rounding could add a step where the number is an integer.
-    num_steps = math.ceil(math.log(first / lowest_alpha) / math.log(10 ** (2 / 3)) - 1e-9)
-    return [*np.geomspace(first, lowest_alpha, num_steps + 1)[:-1].tolist(), alpha]
+    num_steps = math.ceil(math.log(first_alpha / lowest_alpha) / math.log(10 ** (2 / 3)) - 1e-9)
+    return [*np.geomspace(first_alpha, lowest_alpha, num_steps + 1)[:-1].tolist(), alpha]
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
@@ -235,7 +239,8 @@ def flow_between(
         source: (N,3) metres.
         target: (M,3) metres, in the same frame.
         settings: Settings of the solver. With ``static_prior`` only groups of points that certainly
-            move have flow, each as an instance. Without it every point moves, as instance -1.
+            move have flow, and each group is an instance. Without ``static_prior`` every point is
+            moving, with instance -1.
         initial: (N,3) flow to start from, metres; None starts from 0.
 
     Raises:
@@ -244,12 +249,12 @@ def flow_between(
     flow = solve(source, target, settings, initial).flow
     if settings.static_prior:
         return _keep_moving_groups(np.asarray(source, float), np.asarray(target, float), flow)
-    static = FlowField.zero(len(flow))
-    return replace(static, displacement=flow, moving=np.ones(len(flow), bool))
+    field = FlowField.zero(len(flow))
+    return replace(field, displacement=flow, moving=np.ones(len(flow), bool))
 
 
 def _keep_moving_groups(source_points: Float, target_points: Float, flow: Float) -> FlowField:
-    """Keep the flow (N,3) of groups of points that certainly move; other points get flow 0."""
+    """Return a flow field with the flow (N,3) of groups that certainly move, 0 elsewhere."""
     # The objective knows no firing times. All points of the source count as measured before the
     # motion (share 0 of it), all points of the target after it (share 1).
     source = PairCloud(source_points, share=np.zeros(len(source_points)))
@@ -263,7 +268,7 @@ def _keep_moving_groups(source_points: Float, target_points: Float, flow: Float)
         # closer to the target.
         translation, no_yaw = np.median(flow[members], axis=0), 0.0
         motion = RigidMotion(np.append(translation, no_yaw), source_points[members].mean(0))
-        if judge(k, members, motion, source, target).moves():
+        if judge(group=k, members=members, motion=motion, source=source, target=target).moves():
             field.displacement[members] = flow[members]
             field.moving[members] = True
             field.instance[members] = field.instance.max() + 1

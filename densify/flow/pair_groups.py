@@ -35,7 +35,7 @@ from densify.geometry.types import Bool, Float, Float32, Int
 
 _SURFACE_M = 1.0  # greatest distance of a neighbour that spans the surface at a position
 MISSING = 3.0  # cost of a point without surface, and greatest cost
-_NOISE_M = 0.1  # noise of a point and of level ground; a closer point is a counterpart
+_NOISE_M = 0.1  # standard deviation of a point and of level ground; a closer point is a counterpart
 _THINNING_M = 0.15  # voxel in which one point is kept, because points are denser along rings
 
 
@@ -61,11 +61,11 @@ class PairCloud:
         return is_kept
 
     def thin(self, rows: Int) -> Int:
-        """Return those of the given rows that are kept, at most one in each voxel."""
+        """Return the given rows (K,) that are kept by thinning, at most one in each voxel."""
         return rows[self._is_kept[rows]]
 
     def rows_around(self, points: Float) -> Int:
-        """Return the thinned rows in the box around points (K,3), or within 1 m of it."""
+        """Return the thinned rows in the box around points (K,3), or within 1 m of this box."""
         if not len(points):
             return np.zeros(0, np.int64)
         low, high = points.min(axis=0) - _SURFACE_M, points.max(axis=0) + _SURFACE_M
@@ -73,9 +73,10 @@ class PairCloud:
 
 
 def surface_cost(surface: Float, points: Float) -> Float:
-    """Return (N,) costs of points (N,3), 0 to 3: half their squared Mahalanobis distances.
+    """Return half the squared Mahalanobis distances (N,) of points from a surface, at most 3.
 
-    They are distances to the surfaces that the points ``surface`` (M,3) span.
+    The surface at each of the ``points`` (N,3) is a normal distribution (mean m, covariance S) of
+    the nearest points in ``surface`` (M,3). A point p costs (p - m)ᵀ S⁻¹ (p - m) / 2.
     """
     cost = np.full(len(points), MISSING)
     if len(surface) < 3:
@@ -83,15 +84,16 @@ def surface_cost(surface: Float, points: Float) -> Float:
     ranks = np.arange(1, min(NUM_NEAR, len(surface)) + 1)
     distance_m, neighbour = tree_of(surface).query(points, ranks, distance_upper_bound=_SURFACE_M)
     exists = np.isfinite(distance_m)
-    on_surface = np.flatnonzero(exists.sum(axis=1) >= 3)
+    on_surface = np.flatnonzero(exists.sum(axis=1) >= 3)  # three points span a plane
     exists = exists[on_surface]
     neighbour = np.where(exists, np.asarray(neighbour)[on_surface], 0)
     # Normal distribution of the neighbours that exist; others have weight 0
     weight = exists / exists.sum(axis=1, keepdims=True)
-    arms = surface[neighbour]
-    mean = np.einsum("nk,nki->ni", weight, arms)
-    arms -= mean[:, None]
-    covariance = arms.transpose(0, 2, 1) @ (weight[..., None] * arms) + _NOISE_M**2 * np.eye(3)
+    centred = surface[neighbour]
+    mean = np.einsum("nk,nki->ni", weight, centred)
+    centred -= mean[:, None]
+    scatter = centred.transpose(0, 2, 1) @ (weight[..., None] * centred)
+    covariance = scatter + _NOISE_M**2 * np.eye(3)
     offset = points[on_surface] - mean
     scaled_offset = np.linalg.solve(covariance, offset[..., None])[..., 0]
     squared = np.einsum("ni,ni->n", offset, scaled_offset)
@@ -100,7 +102,7 @@ def surface_cost(surface: Float, points: Float) -> Float:
 
 
 def _find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
-    """Return (N,) True for points without a counterpart: no other surface or point in 0.1 m."""
+    """Return the (N,) mask of points without a surface or point of the other cloud near."""
     unmatched = np.flatnonzero(~is_near(tree_of(other_cloud.points), cloud.points, _NOISE_M))
     surface = other_cloud.points[other_cloud.thin(np.arange(len(other_cloud.points)))]
     unexplained = np.zeros(len(cloud.points), bool)
@@ -110,7 +112,7 @@ def _find_unexplained(cloud: PairCloud, other_cloud: PairCloud) -> Bool:
 
 
 def _group_around(points: Float, unexplained: Bool) -> Int:
-    """Return (N,) labels of the groups of points that may be moving, -1 for none.
+    """Return the (N,) labels of the groups of points that may be moving, -1 for none.
 
     Points linked by steps of up to 0.6 m form one group if it is no longer than a vehicle, 20 m. In
     longer groups, such as walls, only points close to ``unexplained`` points form groups.
@@ -120,10 +122,11 @@ def _group_around(points: Float, unexplained: Bool) -> Int:
     np.minimum.at(low, group, points[:, :2])
     high = np.full((num_groups, 2), -np.inf)
     np.maximum.at(high, group, points[:, :2])
-    is_vehicle_sized = np.linalg.norm(high - low, axis=1) <= 20.0  # diagonal
+    # The diagonal of a vehicle is at most 20 m.
+    is_vehicle_sized = np.linalg.norm(high - low, axis=1) <= 20.0
     long_rows = np.flatnonzero(~is_vehicle_sized[group])
     _, cluster = cluster_around(points[long_rows], unexplained[long_rows])
-    # No group has a label of num_groups or more.
+    # Groups have labels below num_groups, hence labels from num_groups on are free for clusters.
     label = group.copy()
     label[long_rows] = np.where(cluster >= 0, num_groups + cluster, -1)
     return label
@@ -143,12 +146,13 @@ def _find_road_users(group: Int, unexplained: Bool, height_m: Float32) -> list[I
         if len(members) >= MIN_POINTS and unexplained[members].sum() >= MIN_FIT:
             # Percentiles, because single points may be of something else
             low_m, high_m = np.percentile(height_m[members], (5, 95))
+            # Treetops usually begin higher than 3.4 m, and facades end higher than 6 m.
             if low_m <= 3.4 and high_m <= 6.0:
                 users.append(members)
     return users
 
 
-# Time between the clouds: assumed if unknown, and the longest that is searched
+# Time between the clouds that is assumed if the time is unknown, and the longest one searched
 _USUAL_S, _LONGEST_S = 0.1, 0.4
 MIN_MOTION_M = _NOISE_M  # a shorter motion, or difference, may be an error of registration
 _APART_M = 0.5  # least distance between displacements from the vote
@@ -165,15 +169,15 @@ class RigidMotion:
     centre: Float  # (3,) centre of the rotation, in the frame of the clouds
 
     def place(self, points: Float, share: float | Float) -> Float:
-        """Return (N,3) points moved from the source's reference time, by a share or (N,) shares."""
+        """Return points (N,3) of the source's reference time, moved by one or (N,) shares."""
         return apply(self.state * np.reshape(share, (-1, 1)), points, self.centre)
 
     def undo(self, points: Float, share: float | Float) -> Float:
-        """Return (N,3) points moved back to the source's reference time, the inverse of `place`."""
+        """Return points (N,3) moved back to the source's reference time, the inverse of `place`."""
         return undo(self.state * np.reshape(share, (-1, 1)), points, self.centre)
 
     def at_start(self, cloud: PairCloud, rows: Int) -> Float:
-        """Return the (K,3) points ``rows`` of a cloud at the source's reference time."""
+        """Return the points ``rows`` (K,) of a cloud, moved to the source's reference time."""
         return self.undo(cloud.points[rows], cloud.share[rows])
 
 
@@ -203,8 +207,8 @@ class Proposal:
     def moves(self, free: Bool | None = None) -> bool:
         """Return True if the group certainly moves.
 
-        Of target points that another motion explains, ``free`` (K,) False, only evidence against
-        the motion counts.
+        Target points that another motion explains have ``free`` (K,) False, and count only against
+        the motion. None means that all are free.
         """
         counted_gain = self.target_gain
         if free is not None:
@@ -218,10 +222,11 @@ class Proposal:
 def judge(
     group: int, members: Int, motion: RigidMotion, source: PairCloud, target: PairCloud
 ) -> Proposal:
-    """Return a motion of one group, source points at rows ``members``, with the evidence for it.
+    """Judge one motion of a group by the evidence for it in both clouds.
 
     Source points are compared with the target. Target points are compared with the source, in which
     only the group moves: points that stay at its old position count against the motion.
+    ``members`` (K,) are the rows of the group's points in the source.
     """
     static = replace(motion, state=np.zeros(4))
     members = source.thin(members)
@@ -231,9 +236,10 @@ def judge(
     points = target.points[rows]
     # If the group moves, a target point lies on the moved group or on the rest of the source.
     source_rows = source.rows_around(points)
-    rest = np.setdiff1d(source_rows, members, assume_unique=True)
+    rest_rows = np.setdiff1d(source_rows, members, assume_unique=True)
     group_cost = surface_cost(motion.at_start(source, members), motion.at_start(target, rows))
-    target_moved_cost = np.minimum(group_cost, surface_cost(source.points[rest], points))
+    rest_cost = surface_cost(source.points[rest_rows], points)
+    target_moved_cost = np.minimum(group_cost, rest_cost)
     target_static_cost = surface_cost(source.points[source_rows], points)
     return Proposal(
         group=group,
@@ -248,20 +254,20 @@ def judge(
 def cost_on_target(
     source: PairCloud, members: Int, target: PairCloud, motion: RigidMotion
 ) -> tuple[Float, Int]:
-    """Return how badly source points ``members`` (K,) fit the target's surfaces under a motion.
+    """Return the costs of source points ``members`` (K,) on the target's surfaces.
 
     Both clouds are moved back to the source's reference time, each point from its own share of the
     motion.
 
     Returns:
-        The (K,) costs (`surface_cost`), and the rows of the thinned target points that, moved back,
-        are in the box around the source points or within 1 m of it.
+        The (K,) costs, 0 to 3, and the rows of the thinned target points that, moved back, are in
+            the box around the source points or within 1 m of this box.
     """
     members_at_start = motion.at_start(source, members)
-    # Target points are measured over some time. Only those can fit that lie around the group at the
-    # first or at the last of these times.
-    ends = target.share.min(), target.share.max()
-    positions = [motion.place(members_at_start, share) for share in ends]
+    # The target is measured over some time. The members cannot be far from the positions that they
+    # have at the first or at the last of its firing times, hence only target points there can fit.
+    end_shares = target.share.min(), target.share.max()
+    positions = [motion.place(members_at_start, share) for share in end_shares]
     rows = target.rows_around(np.concatenate(positions))
     target_at_start = motion.at_start(target, rows)
     is_close = _in_box(target_at_start, members_at_start, _SURFACE_M)
@@ -270,7 +276,7 @@ def cost_on_target(
 
 @dataclass(frozen=True)
 class _Search:
-    """Search for the motions of groups of source points; see `find_movers` for the arguments."""
+    """Search for the motions of groups of source points in the target."""
 
     source: PairCloud  # points above the ground
     target: PairCloud  # points of the other cloud above the ground
@@ -286,44 +292,55 @@ class _Search:
         Motions below 0.1 m or along a wall or a rail are left out.
         """
         points = self.source.points[members]
-        centre = points.mean(axis=0)
-        reach_m = MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
-        limit_m = reach_m
-        displacements = []  # (3,) each, from which the group is aligned
+        vote_radius_m = MAX_SPEED_M_S * min(self.apart_s or _USUAL_S, _LONGEST_S)
+        max_motion_m, initial_flow = vote_radius_m, None
         if self.initial is not None:
-            initial_m = np.median(self.initial[members], axis=0)
-            displacements.append(initial_m)
-            limit_m = max(reach_m, float(np.linalg.norm(initial_m)) + _APART_M)
-        room_m = np.array([limit_m, limit_m, 0.0]) + LINK_M
-        rows = self.target.strips.rows_inside(points.min(0) - room_m, points.max(0) + room_m)
+            # The initial flow may be longer than any displacement that is voted for.
+            initial_flow = np.median(self.initial[members], axis=0)
+            max_motion_m = max(vote_radius_m, float(np.linalg.norm(initial_flow)) + _APART_M)
+        margin_m = np.array([max_motion_m, max_motion_m, 0.0]) + LINK_M  # motions are horizontal
+        rows = self.target.strips.rows_inside(points.min(0) - margin_m, points.max(0) + margin_m)
         rows = rows[self.movable[rows]]
         if not len(rows):
             return []
-        slope = _slope_of(self.ground, centre)
-        displacements += self._vote(members, rows, slope, reach_m)
-        states, judged = list[Float](), list[Proposal]()
+        slope = _slope_of(self.ground, points.mean(axis=0))
+        displacements = self._vote(members, rows, slope, vote_radius_m)
+        if initial_flow is not None:
+            displacements = [initial_flow, *displacements]
+        proposals = []
+        for motion in self._aligned_motions(displacements, members, rows, slope):
+            moved_m = np.linalg.norm(motion.state[:2])
+            is_in_range = MIN_MOTION_M < moved_m <= max_motion_m
+            if is_in_range and not _is_ambiguous(points, motion.state[:3]):
+                proposal = judge(group, members, motion, self.source, self.target)
+                if proposal.moves():
+                    proposals.append(proposal)
+        return proposals
+
+    def _aligned_motions(
+        self, displacements: list[Float], members: Int, rows: Int, slope: Float
+    ) -> list[RigidMotion]:
+        """Return the different motions, one per start, that align members with target rows."""
+        centre = self.source.points[members].mean(axis=0)
+        motions = list[RigidMotion]()
         for displacement in displacements:
             start = RigidMotion(np.append(displacement, 0.0), centre)
             state = self._align(start, members, rows)
-            if state is None or any(_are_alike(state, earlier) for earlier in states):
+            if state is None or any(_are_alike(state, earlier.state) for earlier in motions):
                 continue
-            states.append(state)
             state[2] = state[:2] @ slope  # rise in z: the group stays on the ground
-            moved_m = np.linalg.norm(state[:2])
-            if MIN_MOTION_M < moved_m <= limit_m and not _is_ambiguous(points, state[:3]):
-                motion = RigidMotion(state, centre)
-                judged.append(judge(group, members, motion, self.source, self.target))
-        return [proposal for proposal in judged if proposal.moves()]
+            motions.append(RigidMotion(state, centre))
+        return motions
 
     def refine(self, proposal: Proposal, members: Int) -> Proposal:
-        """Return the proposal with the most likely motion nearby, by a pattern search.
+        """Return the proposal with the most likely motion near that of a proposal.
 
         Alignment is biased towards positions at which scan lines match scan lines. The likelihood
-        is not. Pattern search: Hooke, Jeeves, JACM 1961.
+        is not. A pattern search raises the likelihood (Hooke, Jeeves, JACM 1961).
         """
         slope = _slope_of(self.ground, proposal.motion.centre)
-        # Steps (x, y, z, yaw): along the motion, across the motion, and about the vertical, where a
-        # point 4 m from the centre moves by the same step
+        # Axes (x, y, z, yaw) along and across the motion, and about the vertical, where 1/4 rad
+        # moves a point 4 m from the centre by 1 m
         x, y = proposal.motion.state[:2] / np.linalg.norm(proposal.motion.state[:2])
         axes = np.array([[x, y, 0, 0], [-y, x, 0, 0], [0, 0, 0, 1 / 4]])
         for step_m in (0.08, 0.04, 0.02):
@@ -339,19 +356,19 @@ class _Search:
                     proposal = max(proposal, trial, key=lambda candidate: candidate.gain)
         return proposal
 
-    def _vote(self, members: Int, rows: Int, slope: Float, reach_m: float) -> list[Float]:
-        """Return displacements (3,) that bring most members close to the target points ``rows``."""
+    def _vote(self, members: Int, rows: Int, slope: Float, radius_m: float) -> list[Float]:
+        """Return five displacements (3,) that bring most members near target points ``rows``."""
         group = Group.of(self.source.points[members], self.source.share[members])
         group = group.thinned(FEW_POINTS)
         field = DistanceField.of(self.target.points[rows], self.target.share[rows])
-        # All horizontal displacements within reach, along the ground
-        steps = np.arange(-(reach_m // STEP_M), reach_m // STEP_M + 1) * STEP_M
+        # All displacements along the ground within the radius
+        steps = np.arange(-(radius_m // STEP_M), radius_m // STEP_M + 1) * STEP_M
         displacements = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        displacements = displacements[np.hypot(*displacements.T) <= reach_m]
+        displacements = displacements[np.hypot(*displacements.T) <= radius_m]
         displacements = np.column_stack([displacements, displacements @ slope])
         nearness = np.zeros((len(displacements), len(group.points)), np.uint8)
         field.raise_nearness(nearness, group, displacements)
-        # Of displacements with equal score the shortest wins.
+        # Of displacements with nearly equal nearness the shortest wins.
         score = nearness.mean(axis=1) / 255 - 1e-3 * np.linalg.norm(displacements, axis=1)
         # The best displacement, then the best of those at least 0.5 m away from it, and so on
         voted = []
@@ -361,7 +378,7 @@ class _Search:
         return voted
 
     def _align(self, start: RigidMotion, members: Int, rows: Int) -> Float | None:
-        """Return the state (4,) that aligns members with target rows, None for too few matches."""
+        """Return the state (4,) that aligns members with target points, None for few matches."""
         model = Model(start.at_start(self.source, self.source.thin(members)))
         target_points = start.at_start(self.target, self.target.thin(rows))
         is_close = _in_box(target_points, model.points, GATES_M[0])
@@ -380,7 +397,7 @@ def _are_alike(state: Float, other_state: Float) -> bool:
 
 
 def _in_box(points: Float, inner: Float, slack_m: float) -> Bool:
-    """Return (N,) True for points in the box around the points ``inner``, or close to it."""
+    """Return the (N,) mask of points in the box around ``inner``, or within a slack of the box."""
     if not len(inner):
         return np.zeros(len(points), bool)
     inside = (points > inner.min(axis=0) - slack_m) & (points < inner.max(axis=0) + slack_m)
@@ -388,7 +405,7 @@ def _in_box(points: Float, inner: Float, slack_m: float) -> Bool:
 
 
 def _slope_of(ground: HeightMap, position: Float) -> Float:
-    """Return the slope (2,) of the ground around a position (3,), 0 where it is not plane."""
+    """Return the slope (2,), rise per metre, of the ground around a position (3,), 0 if uneven."""
     steps = np.arange(-8.0, 9.0, 2.0)
     offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     height_m = ground.under(position[:2] + offset)
@@ -401,16 +418,19 @@ def _slope_of(ground: HeightMap, position: Float) -> Float:
 
 
 def _is_ambiguous(points: Float, displacement: Float) -> bool:
-    """Return True if a static wall or rail, seen at another part, could explain the motion."""
+    """Return True if a static wall or rail, seen at another part, could explain a displacement."""
+    # The singular vectors are the axes of the points, from the longest to the shortest. The third
+    # is the normal of a wall.
     _, scale, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
     length_m, width_m, thickness_m = scale / np.sqrt(len(points))  # RMS along the three axes
     moved_m = np.linalg.norm(displacement)
-    if width_m < _RAIL_M and abs(axes[0, 2]) < 0.5:  # level
-        # Any motion may lead to another part of a rail. The back of a far car, narrow and of few
-        # points, looks alike, but is ambiguous only along itself.
+    if width_m < _RAIL_M and abs(axes[0, 2]) < 0.5:  # level: inclined by less than 30 degrees
+        # Any motion may lead to another part of a rail. The back of a far car looks alike: a line
+        # of few points, at most 2.6 m long (0.75 m RMS). Its motion is ambiguous only along the
+        # line, where more than 0.2 of the motion (12 degrees from perpendicular) is too much.
         is_far_car = len(points) < 60 and length_m < 0.75
         return bool(not is_far_car or abs(axes[0] @ displacement) > 0.2 * moved_m)
-    # Along a wall the motion may lead to another part of it. For points on a line any motion may.
+    # A motion within 17 degrees of a wall may lead to another part of it, of a line any motion.
     is_along_wall = abs(axes[-1] @ displacement) < 0.3 * moved_m
     return bool(thickness_m < _WALL_M and (is_along_wall or width_m < _WALL_M))
 
@@ -423,7 +443,7 @@ def find_movers(
     apart_s: float | None = None,
     initial: Float | None = None,
 ) -> tuple[list[RigidMotion], Int]:
-    """Return the motions of the moving groups, and (N,) the motion of each source point, or -1.
+    """Find the groups of source points that certainly move, and their motions.
 
     Args:
         source: N points above the ground.
@@ -434,8 +454,11 @@ def find_movers(
             speeds up to 38 m/s over at most 0.4 s.
         initial: (N,3) flow in metres, or None. The search of a group also starts at the median flow
             of its members.
+
+    Returns:
+        The K motions, and (N,) int, the index of each source point's motion, -1 for static.
     """
-    # Proposals of all groups, then the best consistent ones, refined
+    # All groups propose motions. The best consistent motions are chosen and refined.
     clouds = source, target
     with ThreadPoolExecutor(2) as pool:
         unexplained = list(pool.map(_find_unexplained, clouds, clouds[::-1]))
@@ -456,7 +479,7 @@ def find_movers(
 
 
 def _select_motions(proposals: list[Proposal], num_targets: int) -> list[Proposal]:
-    """Return at most one proposal per group; a target point is explained by one motion only."""
+    """Choose at most one proposal per group; one motion only explains a target point."""
     chosen: dict[int, Proposal] = {}
     explained_by = np.full(num_targets, -1)  # index in ``chosen``
     for i in np.argsort(-_gain_with_neighbours(proposals), kind="stable"):
@@ -473,7 +496,7 @@ def _select_motions(proposals: list[Proposal], num_targets: int) -> list[Proposa
 
 
 def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
-    """Return the (P,) gain of each proposal plus that of groups within 5 m that may move alike."""
+    """Return the (P,) gains of proposals, each plus those of groups within 5 m that move alike."""
     # Two scanners see one car at two positions. A motion of half the speed could move the car from
     # the second position to the first one, but would not fit the group at the first position.
     centres = np.array([proposal.motion.centre for proposal in proposals]).reshape(-1, 3)
@@ -491,7 +514,7 @@ def _gain_with_neighbours(proposals: list[Proposal]) -> Float:
 def _claim_fitting_points(
     k: int, motion: RigidMotion, instance: Int, source: PairCloud, target: PairCloud
 ) -> None:
-    """Assign static points within 1 m of group k to it, in place, if they fit its motion better."""
+    """Assign static points within 1 m of group k to this group if they fit its motion better."""
     members = source.points[instance == k]
     low, high = members.min(axis=0) - _SURFACE_M, members.max(axis=0) + _SURFACE_M
     rows = source.strips.rows_inside(low, high)

@@ -15,9 +15,9 @@ from densify.geometry.types import Bool, Float
 GATES_M = np.repeat([0.8, 0.5, 0.3, 0.2, 0.2], 2)  # greatest distance of a match, per round
 # Greatest sum of the matches' weights: errors of neighbours on a surface are correlated.
 _MAX_WEIGHT = 60.0
-NUM_NEAR = 12  # neighbours that span a surface
+NUM_NEAR = 12  # number of neighbours that span a surface
 MIN_FIT = 5  # least number of matches
-_SURFACE_M = 0.05  # noise of a surface point
+_SURFACE_M = 0.05  # standard deviation of a surface point
 _RIDGE = 0.02  # share of the mean variance that is added, for points on a line
 # Points of a model, and points that are aligned: more would be neighbours with the same error
 _MAX_MODEL_POINTS, _NUM_ALIGNED = 1000, 250
@@ -26,20 +26,20 @@ _LOOSE = 10.0
 
 
 def apply(state: Float, points: Float, centre: Float) -> Float:
-    """Return (N,3) points, turned about a centre and displaced by a state (4,), or by (N,4)."""
+    """Return points (N,3), turned about a centre and displaced by a state (4,) or states (N,4)."""
     return _turned(points - centre, state[..., 3]) + centre + state[..., :3]
 
 
 def undo(state: Float, points: Float, centre: Float) -> Float:
-    """Return the (N,3) points before `apply` moved them by this state about this centre."""
+    """Return the points (N,3) as they were before `apply` with the same state and centre."""
     return _turned(points - centre - state[..., :3], -state[..., 3]) + centre
 
 
-def _turned(arms: Float, yaw: float | Float) -> Float:
-    """Return (N,3) vectors ``arms``, turned by ``yaw`` (rad) about the vertical."""
-    x, y, _ = arms.T
+def _turned(vectors: Float, yaw: float | Float) -> Float:
+    """Return vectors (N,3), turned about the vertical by one yaw (rad), or by (N,) yaws."""
+    x, y, _ = vectors.T
     cos, sin = np.cos(yaw), np.sin(yaw)
-    turned = arms.copy()
+    turned = vectors.copy()
     turned[:, 0] = cos * x - sin * y
     turned[:, 1] = sin * x + cos * y
     return turned
@@ -54,7 +54,7 @@ class Model:
         self.add(points)
 
     def add(self, points: Float) -> None:
-        """Add (N,3) points in the object's frame, in place; more than 1000 in all are thinned."""
+        """Add points (N,3) in the object's frame, in place; above 1000 in all they are thinned."""
         points = np.concatenate([self.points, points])
         points = points[np.argsort(points[:, 0], kind="stable")]
         # contiguous, or the kernels are compiled for both layouts
@@ -63,7 +63,7 @@ class Model:
         self._information = np.full((len(self.points), 3, 3), np.nan)
 
     def covers(self, points: Float, within_m: float) -> Bool:
-        """Return (N,) True for points (N,3, object's frame) within ``within_m`` of the model."""
+        """Return the (N,) mask of points (N,3, object's frame) within ``within_m`` of the model."""
         covered = np.empty(len(points), np.bool_)
         _are_near(points, self.points, within_m, covered)
         return covered
@@ -74,7 +74,7 @@ class Model:
         """Return the state (4,) that fits the model to the points, None for fewer than 5 matches.
 
         Displacement x, y and yaw are solved with Tukey weights. The height z stays as predicted: on
-        an object hit by few beams it would follow the beams. Of many points some 250 are used.
+        an object hit by few beams it would follow the beams. Of many points about 250 are used.
 
         Args:
             points: (N,3) world, metres, all at one time.
@@ -118,7 +118,7 @@ def _nearest(point: Float, surface: Float, within_m: float) -> tuple[int, float]
 
 @Kernel
 def _are_near(points: Float, surface: Float, within_m: float, covered: Bool) -> None:
-    """Write to ``covered`` (N,) whether a surface point is within ``within_m`` of each point."""
+    """Mark points (N,3) within a distance of the surface (M,3, ascending in x) in ``covered``."""
     for i in range(len(points)):
         covered[i] = _nearest(points[i], surface, within_m)[0] >= 0
 
@@ -126,19 +126,21 @@ def _are_near(points: Float, surface: Float, within_m: float, covered: Bool) -> 
 @Kernel
 def _align(
     points: Float,  # (N,3) world
-    centre: Float,
-    predicted: Float,
+    centre: Float,  # (3,) centre of the rotation, object's frame
+    predicted: Float,  # (4,) predicted state
     prior: Float,  # (3,) inverse variances of the predicted x, y and yaw
     surface: Float,  # (M,3) object's frame, ascending in x
     information: Float,  # (M,3,3) of the surface, NaN where it is not known yet
-    state: Float,
+    state: Float,  # (4,) the state to start from, and the result
 ) -> bool:
-    """Fit ``state`` (4,), in place, to points, see `Model.align`; False for too few matches."""
+    """Fit ``state`` in place, so that the points lie on the surface; False for few matches."""
     # Gauss-Newton (iterated least squares), a step per gate. A point in the object's frame moves by
-    # -J x if x, y and yaw of the state change by x. Hence with the inverse covariance A and Tukey's
-    # weight w of each match the step solves H x = g: H = Σ w Jᵀ A J, g = Σ w Jᵀ A residual.
+    # -J d if x, y and yaw of the state change by d. With the inverse covariance A and Tukey's
+    # weight w of each match, the step d solves
+    #   H d = g
+    #   H = Σ w Jᵀ A J
+    #   g = Σ w Jᵀ A residual
     J = np.zeros((3, 3))  # rows: x, y, z of the point; columns: x, y, yaw; the row of z stays 0
-    JA = np.empty((3, 3))  # w Jᵀ A
     from_centre, turned, in_object, residual = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for gate_m in GATES_M:
         # The first two columns of J are the rotation from the world to the object's frame.
@@ -148,7 +150,7 @@ def _align(
         H, g = np.zeros((3, 3)), np.zeros(3)
         num_matches = 0
         for i in range(len(points)):
-            # The point in the object's frame: moved and turned back, see `undo`
+            # The point in the object's frame: moved back, then turned back
             for a in range(3):
                 from_centre[a] = points[i, a] - centre[a] - state[a]
             turned[0] = J[0, 0] * from_centre[0] + J[0, 1] * from_centre[1]
@@ -160,22 +162,16 @@ def _align(
             if row < 0:
                 continue
             num_matches += 1
-            # The match: its residual, inverse covariance and weight
             for a in range(3):
                 residual[a] = in_object[a] - surface[row, a]
-            A = information[row]
-            if np.isnan(A[0, 0]):
-                _inform(surface, row, A)
-            weight = (1 - squared / gate_m**2) ** 2
-            # Its part of the sums; a turn moves the point perpendicular to its arm.
+            if np.isnan(information[row, 0, 0]):
+                _inform(surface, row, information[row])
+            # A yaw of the state by +d turns the point by -d about the centre, hence the point moves
+            # by d (turned y, -turned x). Column 2 of J is minus this vector.
             J[0, 2] = -turned[1]
             J[1, 2] = turned[0]
-            for a in range(3):
-                for b in range(3):
-                    JA[a, b] = weight * (J[0, a] * A[0, b] + J[1, a] * A[1, b])
-                g[a] += JA[a, 0] * residual[0] + JA[a, 1] * residual[1] + JA[a, 2] * residual[2]
-                for b in range(3):
-                    H[a, b] += JA[a, 0] * J[0, b] + JA[a, 1] * J[1, b]
+            weight = (1 - squared / gate_m**2) ** 2
+            _add_match(J, information[row], weight, residual, H, g)
         if num_matches < MIN_FIT:
             return False
         # The matches together weigh at most `_MAX_WEIGHT` against the prediction.
@@ -184,9 +180,26 @@ def _align(
 
 
 @inlined
+def _add_match(
+    J: Float, information: Float, weight: float, residual: Float, H: Float, g: Float
+) -> None:
+    """Add w Jᵀ A J of a match to H (3,3), and w Jᵀ A residual to g (3,), in place."""
+    A = information
+    for a in range(3):
+        # Row a of w Jᵀ A; row 2 of J is 0.
+        JA_x = weight * (J[0, a] * A[0, 0] + J[1, a] * A[1, 0])
+        JA_y = weight * (J[0, a] * A[0, 1] + J[1, a] * A[1, 1])
+        JA_z = weight * (J[0, a] * A[0, 2] + J[1, a] * A[1, 2])
+        g[a] += JA_x * residual[0] + JA_y * residual[1] + JA_z * residual[2]
+        for b in range(3):
+            H[a, b] += JA_x * J[0, b] + JA_y * J[1, b]
+
+
+@inlined
 def _step(H: Float, g: Float, weight: float, predicted: Float, prior: Float, state: Float) -> None:
-    """Move ``state`` (4,), in place, by the solution of the weighted matches and the prediction."""
-    # The prediction is one more measurement, with the inverse variances ``prior``.
+    """Move ``state`` in place to the least-squares fit of the matches and the prediction."""
+    # The prediction is one more measurement, with the inverse variances ``prior``. The step d
+    # solves (weight H + diag(prior)) d = weight g + prior (predicted - state).
     inverse = np.empty((3, 3))
     for a in range(3):
         for b in range(3):
@@ -204,7 +217,7 @@ def _step(H: Float, g: Float, weight: float, predicted: Float, prior: Float, sta
 def _inform(surface: Float, row: int, information: Float) -> None:
     """Write the inverse covariance (3,3) of the surface (M,3), ascending in x, at one row."""
     # Phase 1: the nearest points (the point itself is among them), sorted by distance. The search
-    # goes from the row to both sides, and ends where x alone is farther than the last of them.
+    # goes from the row to both sides, and ends where x alone is farther than the last near point.
     near_row = np.empty(min(NUM_NEAR, len(surface)), np.int64)
     near_squared = np.empty(len(near_row))
     for k in range(len(near_row)):
@@ -218,7 +231,7 @@ def _inform(surface: Float, row: int, information: Float) -> None:
             for a in range(3):
                 squared += (surface[other, a] - surface[row, a]) ** 2
             if squared < near_squared[-1]:
-                # Farther points make room for it, and the last one is dropped.
+                # Farther points move up by one place, and the last point is dropped.
                 k = len(near_row) - 1
                 while k > 0 and near_squared[k - 1] > squared:
                     near_row[k] = near_row[k - 1]
@@ -227,7 +240,7 @@ def _inform(surface: Float, row: int, information: Float) -> None:
                 near_row[k] = other
                 near_squared[k] = squared
             other += step
-    # Phase 2: their covariance
+    # Phase 2: the covariance of these points
     covariance = np.zeros((3, 3))
     mean = np.zeros(3)
     for near in near_row:
@@ -247,7 +260,7 @@ def _inform(surface: Float, row: int, information: Float) -> None:
 
 @inlined
 def _invert(A: Float, inverse: Float) -> None:
-    """Write the inverse of a symmetric matrix A (3,3), by its cofactors."""
+    """Write the inverse of a symmetric matrix A (3,3) to ``inverse`` (3,3), by cofactors."""
     for a in range(3):
         b, c = (a + 1) % 3, (a + 2) % 3
         for d in range(3):

@@ -41,28 +41,31 @@ def estimate_flow(
 
     The flow excludes ego-motion, provided that the common frame does not move with the vehicle.
     Groups of points move only if their motion explains, in both clouds, differences that a static
-    group leaves unexplained. The flow of all other points is exactly 0, also farther than 400 m
-    from the middle. Without ``objective.static_prior`` every point takes the flow of the published
-    objective. With ``flow.engine=paper`` the moving groups take it.
+    group leaves unexplained. The flow of all other points is exactly 0, as is that of points
+    farther than 400 m from the middle. Without ``objective.static_prior`` every point takes the
+    flow of the published objective. With ``flow.engine=paper`` the moving groups take that flow.
+    The published objective uses neither times nor scanners.
 
     Args:
         source: (N,3) metres, z up, with or without the ground.
-        target: (M,3) metres, as ``source``.
+        target: (M,3) metres, in the frame of the source, z up, with or without the ground.
         config: Settings, None for the defaults; ``flow.engine`` and ``objective`` are used.
-        initial: (N,3) flow to start from. It is needed only for objects faster than the search
-            covers: 38 m/s over the time between the clouds, at most 0.4 s; 3.8 m without times.
-        source_offset_ns: (N,) times of the points. Both clouds use one clock, or each counts from
-            its own sweep's reference time; in the second case the target is taken for the next
-            revolution. Without times, the flow is too slow or too fast for an object that the
-            scanner meets earlier or later in the second sweep.
-        target_offset_ns: (M,) times of the points, both or none.
-        source_lidar: (N,) numbers of the points' scanners. Without times, points are compared
-            within a scanner only.
-        target_lidar: (M,) numbers of the points' scanners, both or none.
+        initial: (N,3) flow to start from, metres, None for no guess. A guess is needed only for
+            objects faster than the search covers: 38 m/s over the time between the clouds, at most
+            0.4 s; 3.8 m without times.
+        source_offset_ns: (N,) times of the points, None if unknown. Both clouds use one clock, or
+            each counts from its own sweep's reference time. In the second case the target is taken
+            for the next revolution. Without times, the flow is too slow or too fast for an object
+            that the scanner meets earlier or later in the second sweep.
+        target_offset_ns: (M,) times of the points, given if those of the source are.
+        source_lidar: (N,) numbers of the points' scanners, None for one scanner. Without times,
+            points are compared within a scanner only.
+        target_lidar: (M,) numbers of the points' scanners, given if those of the source are.
 
     Returns:
-        Flow from the middle of the source's times to the target's middle, in the common frame. With
-            times, ``to_reference`` is the motion from a point's own time to the source's middle.
+        Flow from the middle of the source's times to the target's middle, metres, in the common
+            frame. With times, ``to_reference`` is the motion from a point's own time to the
+            source's middle.
 
     Raises:
         InputError: A setting, a shape or a type does not fit, or a cloud is empty or not finite.
@@ -76,6 +79,8 @@ def estimate_flow(
     clouds = checked_cloud(source, "source"), checked_cloud(target, "target")
     times_ns = _columns(source_offset_ns, target_offset_ns, clouds, "offset_ns")
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
+    # The engine ``paper`` solves the published objective. So does ``groups`` without the static
+    # prior, because every point then needs a flow of its own.
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
     initial_flow = None if initial is None else checked_cloud(initial, "initial")
@@ -92,7 +97,7 @@ def _flow_of_groups(
     times_ns: tuple[Int, Int] | None,
     lidars: tuple[Int, Int] | None,
 ) -> FlowField:
-    """Return the flow of the groups of the source that certainly move; see `estimate_flow`."""
+    """Return the flow of the groups of the source that certainly move, 0 for other points."""
     # Coordinates of a map are large. Relative to the middle they lose no accuracy.
     middle = np.median(clouds[0], axis=0)
     points = [cloud - middle for cloud in clouds]
@@ -114,11 +119,7 @@ def _flow_of_groups(
     shares, apart_s = _times_as_shares(clouds, times_ns)
     source_share, target_share = shares
     if apart_s is None and lidars is not None:
-        # Without times, the points of two scanners cannot be compared: each measures an object at
-        # another time. Lifted by 1 km, they are out of reach of each other.
-        _, scanner = np.unique(np.concatenate(lidars), return_inverse=True)
-        for cloud, number in zip(points, np.split(scanner, [len(points[0])]), strict=True):
-            cloud[:, 2] += 1000.0 * number
+        _separate_scanners(points, lidars)
     source_points, target_points = points
     motions, instance = find_movers(
         source=PairCloud(source_points[source_rows], source_share[source_rows]),
@@ -132,7 +133,7 @@ def _flow_of_groups(
     is_low = ~is_obstacle[0] & (heights_m[0] > _MIN_LOW_M)
     _attach_below(source_points, field, near_rows[0][is_low])
 
-    # Phase 3: their flow, from the source's middle time (share 0) to the target's (share 1)
+    # Phase 3: the flow of the groups from the source's middle time to the target's
     to_reference = np.zeros_like(clouds[0])
     for k, motion in enumerate(motions):
         rows = np.flatnonzero(field.instance == k)
@@ -144,8 +145,17 @@ def _flow_of_groups(
     return field if apart_s is None else replace(field, to_reference=to_reference)
 
 
+def _separate_scanners(clouds: list[Float], lidars: tuple[Int, Int]) -> None:
+    """Lift the points of each scanner by another height, in place."""
+    # Without times, the points of two scanners cannot be compared: each measures an object at
+    # another time. Lifted by multiples of 1 km, the scanners are out of reach of each other.
+    _, scanner = np.unique(np.concatenate(lidars), return_inverse=True)
+    for cloud, number in zip(clouds, np.split(scanner, [len(clouds[0])]), strict=True):
+        cloud[:, 2] += 1000.0 * number
+
+
 def _attach_below(points: Float, field: FlowField, low_rows: Int) -> None:
-    """Assign points ``low_rows`` just below a moving group to the group, in place."""
+    """Assign points ``low_rows`` (K,) that lie below a moving group to the group, in place."""
     members = np.flatnonzero(field.instance >= 0)
     if len(members) and len(low_rows):
         _, nearest_member = nearest(tree_of(points[members, :2]), points[low_rows, :2], _BELOW_M)
@@ -178,10 +188,10 @@ def _columns(
 def _times_as_shares(
     clouds: tuple[Float, Float], times_ns: tuple[Int, Int] | None
 ) -> tuple[tuple[Float, Float], float | None]:
-    """Return firing times (N,) and (M,) as shares of the time between the clouds, and that time.
+    """Convert firing times (N,) and (M,) to shares of the time between the clouds.
 
-    Shares are 0 at the middle of the source's times, 1 at the target's. Without times, or if all
-    are equal, the time is None.
+    Shares are 0 at the middle of the source's times, 1 at the target's. The second value is the
+    time between the clouds in seconds; None without times, or if all are equal.
     """
     unknown = (np.zeros(len(clouds[0])), np.ones(len(clouds[1]))), None
     if times_ns is None:
@@ -190,16 +200,16 @@ def _times_as_shares(
     last_ns = np.array([int(np.max(cloud_ns)) for cloud_ns in times_ns])
     middle_ns = first_ns + (last_ns - first_ns) // 2
     revolution_ns = int((last_ns - first_ns).max())
-    gap_ns = int(middle_ns[1] - middle_ns[0])
-    if 2 * abs(gap_ns) < revolution_ns:
+    apart_ns = int(middle_ns[1] - middle_ns[0])
+    if 2 * abs(apart_ns) < revolution_ns:
         # Middles closer than half a sweep: each cloud counts from its own reference time, and the
         # target is the next revolution.
-        gap_ns = revolution_ns
-    if gap_ns == 0:
+        apart_ns = revolution_ns
+    if apart_ns == 0:
         return unknown
-    source_share = (times_ns[0] - middle_ns[0]) / gap_ns
-    target_share = 1 + (times_ns[1] - middle_ns[1]) / gap_ns
-    return (source_share, target_share), abs(gap_ns) * 1e-9
+    source_share = (times_ns[0] - middle_ns[0]) / apart_ns
+    target_share = 1 + (times_ns[1] - middle_ns[1]) / apart_ns
+    return (source_share, target_share), abs(apart_ns) * 1e-9
 
 
 # --- The engine ``pairs``
@@ -220,7 +230,7 @@ def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
 def _flow_to_neighbour(
     source: RegisteredSweep, target: RegisteredSweep, settings: Config
 ) -> FlowField:
-    """Return the flow of a sweep to the reference time of another one, lidar frame of the first."""
+    """Return the flow of a sweep to the reference time of another, in its own lidar frame."""
     if min(len(source.sweep), len(target.sweep)) == 0:
         return FlowField.zero(len(source.sweep))
     source_ns, target_ns = source.sweep.offset_ns, target.sweep.offset_ns
@@ -228,7 +238,7 @@ def _flow_to_neighbour(
     if source_ns is None or target_ns is None:
         source_ns = target_ns = None
     else:
-        target_ns = target_ns + apart_ns  # both since the stamp of the source
+        target_ns = target_ns + apart_ns  # now both count from the stamp of the source
     has_scanners = source.sweep.lidar.any() or target.sweep.lidar.any()
     field = estimate_flow(
         poses.transform(source.T_world_lidar, source.sweep.points),

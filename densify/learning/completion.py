@@ -26,15 +26,15 @@ from densify.learning.training import find_device
 _FOCAL_PX = 500.0
 _CROP_PX = (112, 176)  # height, width
 _WARM_UP = 0.1  # share of the steps before the greatest learning rate
-_LARGEST_GRADIENT = 1.0
+_LARGEST_GRADIENT = 1.0  # norm of the gradient; a greater one is scaled down
 _NUM_COMPARED = 4096  # pixels of a crop on which the loss is taken
 _MOST_TARGETS = 60_000  # pixels of an image that are kept to train on
-_INPUT_SHARE = 0.8  # of the returns, if the others are held out to train on
-_USUAL_LOG_M = 2.7  # where there is no return at all
+_INPUT_SHARE = 0.8  # share of the returns that are input, if the others are held out to train on
+_USUAL_LOG_M = 2.7  # log depth (15 m) of an image without any return
 _NONE = 99.0  # log depth of a pixel without a return
-_NEIGHBOURHOODS_PX = (9, 21)
-_SQUARES_PX = (1, 3, 5, 7, 11, 17, 25, 37, 57, 87, 131)  # sizes of means
-_STEEPNESS = (5.0, 2.0)  # powers of the sizes, by which the means are weighted
+_NEIGHBOURHOODS_PX = (9, 21)  # sides of the squares with the nearest and the farthest return
+_SQUARES_PX = (1, 3, 5, 7, 11, 17, 25, 37, 57, 87, 131)  # sides of the squares of the means
+_STEEPNESS = (5.0, 2.0)  # the mean over a square is weighted by its side to minus this power
 
 
 class Size(NamedTuple):
@@ -56,7 +56,7 @@ SIZES = {
 class Sample(NamedTuple):
     """An image with a sparse depth, and depths to train on, reduced to the common focal length."""
 
-    image: Float32  # (3,h,w) RGB with mean 0 and deviation 1
+    image: Float32  # (3,h,w) RGB with mean 0 and standard deviation 1
     returns: Float32  # (R,3) column, row in px of the reduced image, 0 at its corner; depth in m
     # (T,4) as ``returns``, and weight; None to hold out returns at random
     target: Float32 | None
@@ -71,15 +71,15 @@ class Sample(NamedTuple):
         *,
         focal_px: float,
     ) -> Sample:
-        """Reduce a sample of `densify.DepthDataset`, or maps of one's own.
+        """Make a sample from an image and its depth maps, such as those of `densify.DepthDataset`.
 
         Args:
             image: (3,H,W) RGB, 0 to 1.
             sparse_m: (H,W) depth of the single sweep in metres, 0 for none.
-            target_m: (H,W) depth to train on in metres, 0 for none. None holds out a fifth of the
-                sweep's pixels, others at every step.
+            target_m: (H,W) depth to train on in metres, 0 for none. None trains on a fifth of the
+                sweep's pixels, which are held out anew at every step.
             weight: (H,W) weight of each target in the loss, such as its confidence; None for 1.
-            focal_px: Focal length fx of the image.
+            focal_px: Focal length fx of the image in pixels.
         """
         shape = sparse_m.shape[0], sparse_m.shape[1]
         scale = min(1.0, _FOCAL_PX / focal_px)
@@ -88,16 +88,17 @@ class Sample(NamedTuple):
         target = None
         if target_m is not None:
             weights = np.ones(shape, np.float32) if weight is None else weight
-            target = _listed(target_m, weights, width, height)
+            target = _list_pixels(target_m, weights, width, height)
             if len(target) > _MOST_TARGETS:
                 target = target[np.random.default_rng(0).permutation(len(target))[:_MOST_TARGETS]]
-        returns = _listed(sparse_m, sparse_m, width, height)[:, :3]
+        returns = _list_pixels(sparse_m, sparse_m, width, height)[:, :3]
+        # 1e-3 avoids a division by 0 in an image of one colour.
         small = (small - small.mean((0, 1))) / (small.std() + np.float32(1e-3))
         return Sample(np.ascontiguousarray(small.transpose(2, 0, 1)), returns, target, shape)
 
 
-def _listed(depth_m: Float32, weight: Float32, width: int, height: int) -> Float32:
-    """Return (N,4) column and row in the reduced image, depth, weight of pixels with a depth."""
+def _list_pixels(depth_m: Float32, weight: Float32, width: int, height: int) -> Float32:
+    """Return the (N,4) pixels with a depth: column and row in the reduced image, depth, weight."""
     row, column = np.nonzero((depth_m > 0) & (weight > 0))
     x = (column + 0.5) * (width / depth_m.shape[1])
     y = (row + 0.5) * (height / depth_m.shape[0])
@@ -105,14 +106,14 @@ def _listed(depth_m: Float32, weight: Float32, width: int, height: int) -> Float
 
 
 class Completion(nn.Module):
-    """A U-Net that weighs six depths of each pixel, and adds a change of its own.
+    """A U-Net that averages six depths of each pixel by learned weights, and adds a correction.
 
-    The six are two weighted means of the returns around, and the nearest and the farthest return in
-    two squares. An untrained network takes their mean, mostly of the first.
+    The six depths are two weighted means of the returns around the pixel, and the nearest and the
+    farthest return in each of two squares. An untrained network gives the first depth most weight.
     """
 
     def __init__(self, with_returns: bool = True, size: str = "small") -> None:
-        """Make a network of a size of `SIZES`; without returns, it sees the image alone."""
+        """Make a network of a size of `SIZES`; without returns, its input is the image alone."""
         super().__init__()
         self.with_returns = with_returns
         widths = SIZES[size].widths
@@ -128,6 +129,7 @@ class Completion(nn.Module):
 
     def forward(self, image: Tensor, log_depths: Tensor) -> Tensor:
         """Return the log depth (N,1,h,w) for images (N,3,h,w) and `_log_depths` (N,7,h,w)."""
+        # The network sees the first depth, and the differences of the other depths from it.
         choices, base = log_depths[:, :-1], log_depths[:, :1]
         inputs = [image, base - _USUAL_LOG_M, choices[:, 1:] - base, log_depths[:, -1:]]
         x = self._first(torch.cat(inputs, 1).contiguous(memory_format=torch.channels_last))
@@ -142,14 +144,14 @@ class Completion(nn.Module):
 
 
 def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
-    """Return a convolution of 3 x 3 pixels with its activation."""
+    """Return a layer of a 3 x 3 convolution and its activation."""
     layer = nn.Conv2d(inputs, outputs, 3, stride, 1)
     nn.init.kaiming_normal_(layer.weight, 0.1)
     return nn.Sequential(layer, nn.LeakyReLU(0.1))
 
 
 def _log_depths(returns: Float32, shape: tuple[int, ...], with_returns: bool) -> Float32:
-    """Return (7,h,w): `Completion`'s six log depths, and 1 where there is a return."""
+    """Return the (7,h,w) input of a `Completion`: six log depths, and 1 at pixels with a return."""
     if not with_returns:
         returns = np.zeros((0, 3), np.float32)
     nearest = np.full(shape, _NONE, np.float32)
@@ -167,7 +169,9 @@ def _log_depths(returns: Float32, shape: tuple[int, ...], with_returns: bool) ->
 
 
 def _interpolated(inverse: Float32, has_return: Float32, steepness: float) -> Float32:
-    """Return (h,w) log depth of the mean of returns, weighted by a power of their distance."""
+    """Return the log (h,w) of a distance-weighted mean depth of the returns around each pixel."""
+    # Inverse depths are averaged over squares of growing side s, with weights s^-steepness. Without
+    # any return, 1e-12 gives the usual depth.
     total = np.full(inverse.shape, 1e-12 * np.exp(-_USUAL_LOG_M), np.float32)
     weight = np.full(inverse.shape, 1e-12, np.float32)
     for size in _SQUARES_PX:
@@ -193,41 +197,41 @@ def train(
 
     Args:
         samples: Samples to train on.
-        steps: Number of steps; None takes that of the size.
+        steps: Number of training steps; None takes that of the size.
         seed: Seed of weights, order, crops and flips.
         with_returns: False trains on the image alone (monocular depth).
         size: Size of the network, a name in `SIZES`.
         device: "cpu", "cuda", or "auto" (CUDA if there is one).
         progress: Function called with the number of finished steps.
     """
-    of_size = SIZES[size]
-    steps = of_size.steps if steps is None else steps
+    plan = SIZES[size]
+    steps = plan.steps if steps is None else steps
     if not samples or steps < 1:
         raise InputError(f"got {len(samples)} samples and {steps} steps, expected 1 or more")
     torch.manual_seed(seed)
-    place_of_work = find_device(device)
+    torch_device = find_device(device)
     network = Completion(with_returns, size).train()
-    network = network.to(device=place_of_work, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = network.to(device=torch_device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.Adam(network.parameters())
-    num_steps = max(steps, 3)  # the rise needs two of them, the fall one
+    num_steps = max(steps, 3)  # the learning rate rises for two steps at least, and falls for one
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser,
-        of_size.learning_rate,
+        plan.learning_rate,
         total_steps=num_steps,
         pct_start=max(_WARM_UP, 2 / num_steps),
     )
-    sizes = np.array([sample.image.shape[1:] for sample in samples])
-    height, width = np.minimum(_CROP_PX, sizes.min(0)).tolist()
+    image_sizes = np.array([sample.image.shape[1:] for sample in samples])
+    height, width = np.minimum(_CROP_PX, image_sizes.min(0)).tolist()
     with on_one_thread():
         for step in range(steps):
             rng = np.random.default_rng([seed, step])
-            chosen = rng.choice(len(samples), of_size.batch, replace=len(samples) < of_size.batch)
-            drawn = [_crop(samples[row], (height, width), with_returns, rng) for row in chosen]
-            image, log_depths, place, target = (
-                torch.from_numpy(np.stack(arrays)).to(place_of_work)
-                for arrays in zip(*drawn, strict=True)
+            rows = rng.choice(len(samples), plan.batch, replace=len(samples) < plan.batch)
+            crops = [_crop(samples[row], (height, width), with_returns, rng) for row in rows]
+            image, log_depths, position, target = (
+                torch.from_numpy(np.stack(arrays)).to(torch_device)
+                for arrays in zip(*crops, strict=True)
             )
-            log_m = grid_sample(network(image, log_depths), place[:, None], align_corners=False)
+            log_m = grid_sample(network(image, log_depths), position[:, None], align_corners=False)
             true_m, weight = target.unbind(-1)
             error = (log_m[:, 0, 0] - true_m.log()).abs()
             loss = (weight * error).sum() / weight.sum().clamp(min=1e-9)
@@ -244,40 +248,46 @@ def train(
 def _crop(
     sample: Sample, size: tuple[int, int], with_returns: bool, rng: np.random.Generator
 ) -> tuple[Float32, Float32, Float32, Float32]:
-    """Return image (3,h,w), `_log_depths` (7,h,w), positions (N,2) from -1 to 1, targets (N,2)."""
-    whole = sample.image.shape[1:]
-    top, left = (int(rng.integers(all_px - px + 1)) for all_px, px in zip(whole, size, strict=True))
-    mirrored = rng.random() < 0.5
+    """Return a random crop of a size (h,w), mirrored half the time.
+
+    In order: image (3,h,w), `_log_depths` (7,h,w), positions (N,2) of targets in the crop from -1
+    to 1, and targets (N,2), which are depth (m) and weight.
+    """
+    image_px = sample.image.shape[1:]
+    height, width = size
+    top = int(rng.integers(image_px[0] - height + 1))
+    left = int(rng.integers(image_px[1] - width + 1))
+    is_mirrored = rng.random() < 0.5
     returns, target = sample.returns, sample.target
     if target is None:
         is_input = rng.random(len(returns)) < _INPUT_SHARE
         target = np.column_stack([returns[~is_input], np.ones((~is_input).sum(), np.float32)])
         returns = returns[is_input]
-    corner, extent = np.array((left, top), np.float32), np.array(size[::-1], np.float32)
-    place = 2 * (target[:, :2] - corner) / extent - 1
-    within = np.flatnonzero(_inside(place))
-    if not len(within):  # no depth to compare with: no weight
-        place, within = np.zeros((1, 2), np.float32), np.zeros(1, int)
+    corner, extent = np.array((left, top), np.float32), np.array((width, height), np.float32)
+    position = 2 * (target[:, :2] - corner) / extent - 1
+    rows_inside = np.flatnonzero(_inside(position))
+    if not len(rows_inside):  # no depth to compare with: a target of weight 0
+        position, rows_inside = np.zeros((1, 2), np.float32), np.zeros(1, int)
         target = np.array([[0, 0, 1, 0]], np.float32)
-    chosen = within[(rng.random(_NUM_COMPARED) * len(within)).astype(int)]
+    rows = rows_inside[(rng.random(_NUM_COMPARED) * len(rows_inside)).astype(int)]
     returns = returns[_inside(2 * (returns[:, :2] - corner) / extent - 1)]
     log_depths = _log_depths(returns - (left, top, 0), size, with_returns)
-    image, place = sample.image[:, top : top + size[0], left : left + size[1]], place[chosen]
-    if mirrored:
+    image, position = sample.image[:, top : top + height, left : left + width], position[rows]
+    if is_mirrored:
         image, log_depths = image[..., ::-1], log_depths[..., ::-1]
-        place = place * np.array((-1, 1), np.float32)
-    return image.copy(), log_depths.copy(), place, target[chosen, 2:]
+        position = position * np.array((-1, 1), np.float32)
+    return image.copy(), log_depths.copy(), position, target[rows, 2:]
 
 
-def _inside(place: Float32) -> Bool:
-    """Return (N,) True for positions (N,2) between -1 and 1."""
-    column, row = place.T
+def _inside(position: Float32) -> Bool:
+    """Return the (N,) mask of positions (N,2) between -1 and 1."""
+    column, row = position.T
     inside: Bool = (column > -1) & (column < 1) & (row > -1) & (row < 1)
     return inside
 
 
 def predict(network: Completion, sample: Sample) -> Float32:
-    """Return the depth (H,W) in metres of every pixel of the original image."""
+    """Return the depth (H,W) in metres that a network predicts for the original image."""
     log_depths = _log_depths(sample.returns, sample.image.shape[1:], network.with_returns)
     device = next(network.parameters()).device
     inputs = [torch.from_numpy(array)[None].to(device) for array in (sample.image, log_depths)]

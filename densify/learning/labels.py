@@ -41,7 +41,7 @@ _MOVES_M_S = 0.5
 class Label:
     """The scene flow label of one sweep with N points."""
 
-    registered: RegisteredSweep
+    registered: RegisteredSweep  # the sweep of the points
     after: RegisteredSweep  # the next sweep
     field: FlowField  # flow to the next sweep, in the sweep's lidar frame, ego-motion removed
     sure: Bool  # (N,) True for points whose flow is certain
@@ -59,9 +59,9 @@ class BoxMargins(NamedTuple):
 def label_sweeps(
     sequence: LidarSequence, frames: Sequence[int], config: Config, progress: Progress | None = None
 ) -> Iterator[tuple[int, Label | ComputationError | InputError]]:
-    """Yield (frame number, label or error) of each sweep with a next sweep and with boxes.
+    """Yield the frame number, and the label or error, of each sweep that can have a label.
 
-    A recording without any boxes raises InputError.
+    The sweep and its next sweep must have boxes. A recording without any raises InputError.
     """
     boxes = getattr(sequence, "boxes", None)
     if boxes is None or all(boxes(frame) is None for frame in sequence.frames):
@@ -81,7 +81,7 @@ def label_sweeps(
 
 
 def _label(recording: Recording, boxes: Callable[[int], Boxes | None], frame: int) -> Label | None:
-    """Return the label of a sweep, None without a next sweep or without boxes of both."""
+    """Return the label of a sweep, None if the sweep or its next sweep has no boxes."""
     stretch = recording.window(frame)
     following = next((other for other in stretch.frames if other > frame), None)
     source_boxes = boxes(frame)
@@ -103,7 +103,7 @@ def write_label(folder: Path, label: Label, overwrite: bool) -> Path:
     if path.exists() and not overwrite:
         raise InputError(f"{path}: there already, kept; give --overwrite to replace it")
     total = poses.transform(label.T_after_sweep, sweep.points + field.total) - sweep.points
-    # total_flow includes ego-motion, valid marks certain flow
+    # In the file ``total_flow`` includes ego-motion, and ``valid`` marks certain flow.
     data = flow_npz(field, row=sweep.row, total_flow=total, object=field.instance, valid=label.sure)
     write_file(path, data)
     return path
@@ -116,16 +116,20 @@ def flow_of_boxes(
     next_boxes: Boxes,
     margins: BoxMargins | None = None,
 ) -> tuple[FlowField, Bool]:
-    """Return the flow of the N points of one sweep to the next, and which flows are certain.
+    """Return the flow of the N points of one sweep to the next, by the boxes of both sweeps.
 
-    Both sweeps have boxes; those of one object share the track name. Only pose and time of the
-    sweep ``after`` are used. ``margins`` is None for the defaults.
+    Args:
+        source: The sweep of the points.
+        after: The next sweep, of which only pose and time are used.
+        boxes: Boxes of ``source``.
+        next_boxes: Boxes of ``after``; those of one object share the track name.
+        margins: Margins around the boxes, None for the defaults.
 
     Returns:
         The flow with ego-motion removed, in the lidar frame of ``source``; ``instance`` is the row
-            of the point's box, -1 for no box. Then (N,) True where the flow is certain. It is False
-            for points in two boxes, just outside a box, at the bottom of a moving box, in a box
-            that the next sweep lacks, or in image areas without annotation.
+            of the point's box, -1 for no box. Then the (N,) mask of points with certain flow. Flow
+            is uncertain for points in two boxes, just outside a box, at the bottom of a moving box,
+            in a box that the next sweep lacks, or in image areas without annotation.
     """
     margins = margins or BoxMargins()
     points = source.sweep.points
@@ -133,12 +137,12 @@ def flow_of_boxes(
     num_inside = np.zeros(len(points), np.int64)  # number of boxes that hold each point
     is_near_box = np.zeros(len(points), bool)
     sure = _is_annotated(boxes.view, points)
-    least_m = _MOVES_M_S * (after.sweep.stamp_ns - source.sweep.stamp_ns) * 1e-9
+    min_motion_m = _MOVES_M_S * (after.sweep.stamp_ns - source.sweep.stamp_ns) * 1e-9
     T_source_after = poses.inverse(source.T_world_lidar) @ after.T_world_lidar
     T_source_next_boxes = T_source_after @ _at_reference(next_boxes, after)
     next_pose = dict(zip(next_boxes.track, T_source_next_boxes, strict=True))
     for k, T_source_box in enumerate(_at_reference(boxes, source)):
-        # Points in the grown box, by their positions in the frame of the box
+        # Phase 1: points in the grown box, by their positions in the frame of the box
         rows = _rows_around(boxes, k, T_source_box, source, margins)
         in_box = poses.transform(poses.inverse(T_source_box), points[rows])
         outside_m = (np.abs(in_box) - boxes.size_m[k] / 2).max(axis=1)
@@ -148,11 +152,11 @@ def flow_of_boxes(
         num_inside[rows] += 1
         field.instance[rows] = k
 
-        # Their motion with the box
+        # Phase 2: the motion of these points with the box
         T_source_next_box = next_pose.get(boxes.track[k]) if boxes.track[k] else None
         if T_source_next_box is None:
             sure[rows] = False
-        elif np.linalg.norm(T_source_next_box[:3, 3] - T_source_box[:3, 3]) >= least_m:
+        elif np.linalg.norm(T_source_next_box[:3, 3] - T_source_box[:3, 3]) >= min_motion_m:
             field.displacement[rows] = poses.transform(T_source_next_box, in_box) - points[rows]
             field.moving[rows] = True
             sure[rows[in_box[:, 2] < margins.foot_m - boxes.size_m[k, 2] / 2]] = False
@@ -166,7 +170,7 @@ def flow_of_boxes(
 def _rows_around(
     boxes: Boxes, k: int, T_lidar_box: Float, registered: RegisteredSweep, margins: BoxMargins
 ) -> Int:
-    """Return the indices of the points that may be in or beside box k."""
+    """Return the rows of the points that may be in box k or in the margins around this box."""
     sweep = registered.sweep
     reach_m = np.linalg.norm(boxes.size_m[k] / 2 + margins.grown_m + margins.unsure_m)
     offset_m = np.abs(sweep.points[:, :2] - T_lidar_box[:2, 3])
@@ -177,7 +181,7 @@ def _rows_around(
 
 
 def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
-    """Return the (K,4,4) box poses, lidar frame, deskewed to the reference time like the points."""
+    """Return the box poses (K,4,4), lidar frame, deskewed to the sweep's reference time."""
     if boxes.offset_ns is None:
         return boxes.T_lidar_box
     offset_s = np.asarray(boxes.offset_ns[:, None] * 1e-9, np.float64)
@@ -186,7 +190,7 @@ def _at_reference(boxes: Boxes, registered: RegisteredSweep) -> Float:
 
 
 def _is_annotated(view: BoxView | None, points: Float) -> Bool:
-    """Return (N,) True for the points (N,3, lidar frame) in the annotated image area."""
+    """Return the (N,) mask of points (N,3, lidar frame) in the annotated image area."""
     if view is None:
         return np.ones(len(points), bool)
     uv, visible = image_points(view.camera, poses.transform(view.camera.T_cam_lidar, points))

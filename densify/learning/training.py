@@ -47,20 +47,20 @@ from densify.readers import open_sequence
 from densify.readers.street import Street
 
 STREETS = "streets"  # specification of a new simulated street for every clip
-_PRESETS, _SHARES = ("street", "crossing", "highway"), (0.5, 0.25, 0.25)
+_PRESETS, _SHARES = ("street", "crossing", "highway"), (0.5, 0.25, 0.25)  # of new streets
 _RECORDED_POSES = {"register": {"source": "dataset"}}
-_CLIP_SWEEPS = 7
+_CLIP_SWEEPS = 7  # number of sweeps in a clip
 _MAX_TRIES = 8  # key frames of a recording at which a clip may fail
-_NUM_MIXED = 4  # clips whose pairs are mixed
-_PAIRS_OF_CLIP = 48
+_NUM_MIXED = 4  # number of clips whose pairs are mixed
+_PAIRS_OF_CLIP = 48  # number of pairs drawn from a clip
 _MAX_DRAWN = 4096  # greatest number of points of source, and of target, in the objective
-_SCALES = (0.95, 1.05)
-ALPHA, NUM_NEIGHBORS = 4.0, 50
-_FAST_M_S = 1.0
+_SCALES = (0.95, 1.05)  # least and greatest scale of a sample
+ALPHA, NUM_NEIGHBORS = 4.0, 50  # weight of smoothness, neighbours in the graph of the objective
+_FAST_M_S = 1.0  # speed from which a moving point counts as fast
 _LEARNING_RATE = 2e-3
-_LARGEST_GRADIENT = 1.0
+_LARGEST_GRADIENT = 1.0  # norm of the gradient; a greater one is scaled down
 _WARM_UP, _COOL_DOWN = 0.05, 0.5  # shares of the training's steps
-_NUM_AVERAGED = 50  # number of losses
+_NUM_AVERAGED = 50  # number of last losses whose mean is told
 Predict = Callable[[Sweeps], Tensor]
 
 
@@ -125,8 +125,8 @@ def _on_device(value: Any, device: torch.device) -> Any:
 
 
 def _learning_rate(done: float) -> float:
-    """Return the learning rate at a share of the training: a rise, a plateau, half a cosine."""
-    rate = min(1.0, (done + 0.002) / _WARM_UP)
+    """Return the learning rate at a share of the steps: a rise, a plateau, half a cosine."""
+    rate = min(1.0, (done + 0.002) / _WARM_UP)  # not 0 at the first step
     if done > 1 - _COOL_DOWN:
         rate = 0.5 + 0.5 * np.cos(np.pi * (done - 1 + _COOL_DOWN) / _COOL_DOWN)
     return _LEARNING_RATE * max(float(rate), 0.01)
@@ -155,14 +155,14 @@ Clip = tuple[ClipSweep, ...]  # neighbouring sweeps in the order of time
 
 @dataclass(frozen=True)
 class ClipMaker:
-    """Make clips by number: the same number gives the same clip, in any process."""
+    """Maker of numbered clips; the same number gives the same clip, in any process."""
 
     data: tuple[str, ...]  # specifications of recordings, or `STREETS`
     seed: int
-    teacher: str = "objective"  # source of the labels, as in `make_clip`
+    teacher: str = "objective"  # source of the labels: "objective" (none), "engine" or "truth"
 
     def __call__(self, number: int) -> Clip:
-        """Return the clip of a number, at a recording and key that the number determines."""
+        """Return the clip of a number, which determines the recording and the key frame."""
         rng = np.random.default_rng([self.seed, number])
         spec = self.data[int(rng.integers(len(self.data)))]
         is_new_street = spec.partition("?")[0] == STREETS
@@ -211,9 +211,9 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str)
         motion = estimate_motion(Scene(stretch, heights), settings, "groups")
     origin, begin_ns = stretch[key].T_world_lidar[:3, 3], stretch.sweeps[0].sweep.stamp_ns
     sweeps = []
-    for before, registered, after in zip(
-        (frames[0], *frames), stretch.sweeps, (*frames[1:], frames[-1]), strict=False
-    ):
+    # At the ends a sweep is its own neighbour: the flow there is 0.
+    before_frames, after_frames = (frames[0], *frames[:-1]), (*frames[1:], frames[-1])
+    for before, registered, after in zip(before_frames, stretch.sweeps, after_frames, strict=True):
         frame, above = registered.frame, AboveGround.of(registered, heights)
         flow = moving = None
         if teacher == "truth" and sequence.truth is not None:
@@ -225,6 +225,7 @@ def make_clip(sequence: LidarSequence, key: int, settings: Config, teacher: str)
             flow = [field.displacement[above.row] for field in fields]
             moving = (fields[0].moving & ~fields[0].lost)[above.row]
         if flow is not None:
+            # From the lidar frame to world axes: row vectors times the transposed rotation
             flow = (np.stack(flow) @ registered.T_world_lidar[:3, :3].T).astype(np.float32)
         sweeps.append(
             ClipSweep(
@@ -256,7 +257,7 @@ class Sample(NamedTuple):
 
 
 def samples(make: ClipMaker) -> Iterator[Sample]:
-    """Yield samples without end, of clips from ``make``."""
+    """Yield samples without end, from the clips of a maker; pairs of four clips are mixed."""
     for group in count():
         mixed = [make(group * _NUM_MIXED + n) for n in range(_NUM_MIXED)]
         rng = np.random.default_rng([make.seed, group, 1])
@@ -281,7 +282,8 @@ def sample_of(
 ) -> Sample:
     """Return the training sample of two neighbouring sweeps of a clip, by their indices.
 
-    ``rng`` turns, mirrors, scales and draws the sample at random. None changes nothing.
+    ``rng`` turns, mirrors and scales the sample at random, and chooses its points. None changes
+    nothing, and chooses points evenly.
     """
     source_sweep, target_sweep = clip[source], clip[target]
     augmentation = np.eye(3, dtype=np.float32) if rng is None else _random_change(rng)
@@ -292,21 +294,22 @@ def sample_of(
         points = torch.from_numpy((sweep.points - source_sweep.origin_m) @ augmentation.T)
         return NetworkCloud(points, torch.from_numpy(sweep.height_m * scale))
 
-    numbers = order_for(source, target, len(clip))
-    sweeps = tuple(None if number is None else cloud(number) for number in numbers)
+    needed = order_for(source, target, len(clip))
+    sweeps = tuple(None if number is None else cloud(number) for number in needed)
     points = cloud(source).points, cloud(target).points
     in_reach = [(xyz[:, :2].abs() < REACH_M).all(dim=1) for xyz in points]
-    drawn = [_draw(is_within.numpy(), rng) for is_within in in_reach]
+    source_rows, target_rows = (_draw(is_within.numpy(), rng) for is_within in in_reach)
     flow = moving = None
     if source_sweep.flow is not None:
         flow = torch.from_numpy(source_sweep.flow[int(target > source)] @ augmentation.T)
         moving = torch.from_numpy(source_sweep.moving)
     duration_s = abs(target_sweep.time_s - source_sweep.time_s)
-    return Sample(sweeps, drawn[0], points[1][drawn[1]], in_reach[0], duration_s, flow, moving)
+    drawn_target = points[1][target_rows]
+    return Sample(sweeps, source_rows, drawn_target, in_reach[0], duration_s, flow, moving)
 
 
 def _random_change(rng: np.random.Generator) -> Float32:
-    """Return a (3,3) matrix that turns about z, mirrors half the time, and scales."""
+    """Return a random matrix (3,3) that turns about z, mirrors half the time, and scales."""
     angle = rng.uniform(0, 2 * np.pi)
     cosine, sine = np.cos(angle), np.sin(angle)
     turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
@@ -315,7 +318,7 @@ def _random_change(rng: np.random.Generator) -> Float32:
 
 
 def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
-    """Return at most `_MAX_DRAWN` rows where the mask is True, at random or without rng evenly."""
+    """Return at most 4096 rows where the mask is True, at random, or evenly without ``rng``."""
     rows = np.flatnonzero(within)
     if len(rows) > _MAX_DRAWN:
         every = np.arange(_MAX_DRAWN) * len(rows) // _MAX_DRAWN
@@ -327,7 +330,7 @@ def _draw(within: np.ndarray, rng: np.random.Generator | None) -> Tensor:
 
 
 def objective_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the published objective of a sample's drawn points, m² per point, as 0-d tensor."""
+    """Return the published objective of a sample's drawn points, m² per point, a 0-d tensor."""
     source: Tensor = sample.sweeps[0].points[sample.drawn]  # type: ignore[union-attr]
     graph = knn_graph(source.detach().cpu().double().numpy(), NUM_NEIGHBORS)
     flow = predict(sample.sweeps)[sample.drawn]
@@ -336,15 +339,16 @@ def objective_loss(predict: Predict, sample: Sample) -> Tensor:
 
 
 def supervised_loss(predict: Predict, sample: Sample) -> Tensor:
-    """Return the sum of the mean errors over static, slow and fast points, metres, 0-d tensor."""
-    flow, true, moving = predict(sample.sweeps), sample.flow, sample.moving
-    fast = true.norm(dim=1) >= _FAST_M_S * sample.duration_s
+    """Return the sum of the mean errors of static, slow and fast points, metres, a 0-d tensor."""
+    flow, true_flow, moving = predict(sample.sweeps), sample.flow, sample.moving
+    is_fast = true_flow.norm(dim=1) >= _FAST_M_S * sample.duration_s
     # The gradient of the norm itself is not a number at 0.
-    error_m = ((flow - true) ** 2).sum(dim=1).add(1e-8).sqrt()
-    sets = (~moving, moving & ~fast, moving & fast)
-    counted = [sample.in_reach & each for each in sets]
-    means = [error_m[mask].mean() for mask in counted if bool(mask.any())]
-    return torch.stack(means).sum() if means else (flow * 0).sum()
+    error_m = ((flow - true_flow) ** 2).sum(dim=1).add(1e-8).sqrt()
+    masks = [sample.in_reach & kind for kind in (~moving, moving & ~is_fast, moving & is_fast)]
+    means = [error_m[mask].mean() for mask in masks if bool(mask.any())]
+    if not means:
+        return (flow * 0).sum()  # a loss of 0 that still has a gradient
+    return torch.stack(means).sum()
 
 
 TEACHERS = {"objective": objective_loss, "engine": supervised_loss, "truth": supervised_loss}

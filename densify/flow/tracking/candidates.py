@@ -36,8 +36,8 @@ class Strips:
 
     def __init__(self, points: Float) -> None:
         """Index the points (N,3, metres), given in scan order."""
-        # (3,S) bounds of the strips, and (S,3,32) their points: both are compared along contiguous
-        # memory.
+        # Bounds (3,S) and points (S,3,32) of the strips, laid out so that comparisons run along
+        # contiguous memory
         begins = np.arange(0, len(points), _STRIP)
         self._low = np.ascontiguousarray(np.minimum.reduceat(points, begins).T)
         self._high = np.ascontiguousarray(np.maximum.reduceat(points, begins).T)
@@ -60,7 +60,7 @@ class Strips:
 class Obstacles:
     """The C points above the ground (obstacles) in one sweep, or in a `Batch` of sweeps.
 
-    Candidates are those that may move.
+    Candidates are the obstacles that may move.
     """
 
     row: Int  # (C,) index into the sweep's points
@@ -72,7 +72,7 @@ class Obstacles:
 
     @property
     def candidate(self) -> Bool:
-        """(C,) True for candidates: seeds and points close to seeds."""
+        """The (C,) mask of the candidates: seeds and points close to seeds."""
         return self.cluster >= 0
 
     @cached_property
@@ -83,7 +83,7 @@ class Obstacles:
 
 @dataclass(frozen=True)
 class Batch:
-    """Consecutive sweeps within 0.1 s, searched together; one at 10 Hz, see `Clock.batches`."""
+    """Consecutive sweeps within 0.1 s (one at 10 Hz), merged to search for moving objects."""
 
     sweeps: tuple[int, ...]  # indices of the sweeps in the stretch
     # Middle between the first and the last reference time, since the stretch's first sweep
@@ -94,7 +94,7 @@ class Batch:
 
     @staticmethod
     def of(sweeps: Sequence[int], obstacles: Sequence[Obstacles], clock: Clock) -> Batch:
-        """Build a batch from sweep indices, with the obstacles and clock of the whole stretch."""
+        """Build a batch of some ``sweeps``, with the obstacles and clock of the whole stretch."""
         parts = [obstacles[j] for j in sweeps]
         first_ns, last_ns = clock.time_ns[[sweeps[0], sweeps[-1]]].tolist()
         begins = np.cumsum([0] + [len(part.points) for part in parts[:-1]]).tolist()
@@ -107,11 +107,11 @@ class Batch:
         )
 
     def gather(self, columns: Sequence[NDArray[T]]) -> NDArray[T]:
-        """Return the ``columns`` of this batch's sweeps, each (C,...), in one as ``obstacles``."""
+        """Return the values of the batch's obstacles, from the values (C,...) of every sweep."""
         return np.concatenate([columns[j] for j in self.sweeps])
 
     def split(self, rows: Int) -> dict[int, Int]:
-        """Convert ascending rows (K,) of ``obstacles`` to rows by sweep, without empty sweeps."""
+        """Convert ascending rows of ``obstacles`` to rows by sweep index, without empty sweeps."""
         rows_of_sweeps = np.split(rows, np.searchsorted(rows, self.begins[1:]))
         sweeps = zip(self.sweeps, rows_of_sweeps, self.begins, strict=True)
         return {j: sweep_rows - begin for j, sweep_rows, begin in sweeps if len(sweep_rows)}
@@ -121,6 +121,7 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
     """Concatenate the obstacles of sweeps; clusters within `LINK_M` of each other become one."""
     if len(sweeps) == 1:
         return sweeps[0]
+    # All fields but the last one, ``num_clusters``, are columns.
     row, points, time_s, seed, label = (
         np.concatenate([getattr(sweep, column.name) for sweep in sweeps])
         for column in fields(Obstacles)[:-1]
@@ -129,9 +130,9 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
     first_labels = np.cumsum([0] + [sweep.num_clusters for sweep in sweeps])
     candidate = np.flatnonzero(label >= 0)
     label[candidate] += np.repeat(first_labels[:-1], [s.candidate.sum() for s in sweeps])
-    # Two clusters are merged if they share a group: points of all sweeps that are linked. The nodes
-    # of the graph are clusters, then groups. Each candidate is an edge between its cluster and its
-    # group, and the connected components are the merged clusters.
+    # Two clusters are merged if they share a group, which is a set of linked points of all sweeps.
+    # The nodes of the graph are clusters, then groups. Each candidate is an edge between its
+    # cluster and its group, and the connected components are the merged clusters.
     num_groups, group = link(points[candidate], LINK_M)
     num_nodes = int(first_labels[-1]) + num_groups
     edges = label[candidate], first_labels[-1] + group
@@ -142,10 +143,11 @@ def _merge(sweeps: Sequence[Obstacles]) -> Obstacles:
 
 
 def find_candidates(stretch: Stretch, space: FreeSpace, ground: HeightMap) -> tuple[Obstacles, ...]:
-    """Return, for each sweep in order, its points above the ground, and which of them may move.
+    """Return the obstacles of each sweep in order, with the candidates: obstacles that may move.
 
-    A point is a seed if another sweep saw through it. Points close to seeds are candidates too,
-    because usually only a part of a moving object's points is seen through.
+    An obstacle is a point above the ground. It is a seed if another sweep saw through it. Obstacles
+    close to seeds are candidates too, because usually only a part of a moving object's points is
+    seen through.
     """
 
     def find_in_sweep(i: int) -> Obstacles:
@@ -168,10 +170,13 @@ def find_candidates(stretch: Stretch, space: FreeSpace, ground: HeightMap) -> tu
 def cluster_rings(
     points: Float, rows: Int, seed: Bool, registered: RegisteredSweep, sensors: Sensors
 ) -> tuple[int, Int]:
-    """Return the clusters of a sweep's points (N,3), world, at ``rows``, see `cluster_around`.
+    """Cluster points (N,3, world) of a sweep around seeds (N,), as `cluster_around` does.
 
-    Heights are compressed until rings are at most 0.35 m apart. Otherwise the rings of an object
-    would be too far apart to be linked.
+    ``rows`` (N,) are the points' rows in the sweep. Heights are compressed until rings are at most
+    0.35 m apart. Otherwise the rings of an object would be too far apart to be linked.
+
+    Returns:
+        The number of clusters, and the (N,) labels from 0, -1 for points in no cluster.
     """
     sweep = registered.sweep
     gap_m = sensors.gap_m(sweep.points[rows], sweep.lidar[rows])
@@ -182,7 +187,7 @@ def cluster_rings(
 
 
 def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
-    """Return (N,) firing times of ``rows`` of sweep i, seconds since the first reference time."""
+    """Return the firing times (N,) of ``rows`` of sweep i, s since the first reference time."""
     sweep = stretch.sweeps[i].sweep
     offset_ns = np.zeros(len(rows), np.int64) if sweep.offset_ns is None else sweep.offset_ns[rows]
     begin_ns = stretch.sweeps[0].sweep.stamp_ns
@@ -190,12 +195,12 @@ def firing_times_s(stretch: Stretch, i: int, rows: Int) -> Float:
 
 
 def cluster_around(points: Float, seed: Bool) -> tuple[int, Int]:
-    """Return the clusters of seeds and of points (N,3) within 0.4 m of seeds, linked within 0.6 m.
+    """Cluster seeds and points (N,3) within 0.4 m of seeds, linked by steps of up to 0.6 m.
 
-    Seeds with a share of other seeds below 0.4 around them, as in a hedge, do not count.
+    A seed does not count if less than 40 % of the points around it are seeds, as in a hedge.
 
     Returns:
-        The number of clusters, and (N,) labels from 0, -1 for points in no cluster.
+        The number of clusters, and the (N,) labels from 0, -1 for points in no cluster.
     """
     cluster = np.full(len(points), -1, np.int64)
     rows = np.flatnonzero(close_to_seeds(points, seed, 0.4, MIN_SEED_SHARE))

@@ -46,13 +46,13 @@ class SweepPoints:
     def of(
         stretch: Stretch, i: int, ground: HeightMap, obstacles: Obstacles, sensors: Sensors
     ) -> SweepPoints:
-        """Return the points over 0.08 m above the ground of sweep index i with its obstacles."""
+        """Return the points of sweep index i that are more than 0.08 m above the ground."""
         registered = stretch.sweeps[i]
         points = poses.transform(registered.T_world_lidar, registered.sweep.points)
         height_m = ground.above(points)
         row = np.flatnonzero(height_m > _MIN_HEIGHT_M)
         gap_m = sensors.gap_m(registered.sweep.points[row], registered.sweep.lidar[row])
-        # Candidates may lie farther from the shape: other sweeps saw through them.
+        # Other sweeps saw through candidates, hence candidates may lie farther from the shape.
         candidate = np.zeros(len(points), bool)
         candidate[obstacles.row[obstacles.candidate]] = True
         reach_m = np.where(candidate[row], _REACH, 1.0) * near_m(gap_m)
@@ -75,15 +75,15 @@ class SweepPoints:
 
 
 def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Shape:
-    """Return the accumulated shape of a track, for slow objects without their surroundings.
+    """Return the accumulated shape of a track, without the surroundings of slow objects.
 
-    Objects faster than 2 m/s in their middle sweep keep all points. Otherwise three kinds of points
-    are dropped, unless none would remain:
+    Objects faster than 2 m/s in their middle sweep keep all points. From slower objects three kinds
+    of points are dropped, unless no point would remain:
 
     - Echoes merged with a wall's. They occur only in even or only in odd sweeps.
     - Points of a bush. They are static, or lie among static points.
-    - Points of a wall. They are hardly ever seen through. Sides of slow cars are alike, hence
-      these points are dropped only if the rest is shorter than 1.5 m.
+    - Points of a wall. They are hardly ever seen through. So are the sides of slow cars, hence
+      these points are dropped only if the remaining points span less than 1.5 m.
     """
     sweeps = sorted(track.claimed)
     clouds = {j: track.in_object(obstacles[j], track.claimed[j]) for j in sweeps}
@@ -95,10 +95,11 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
     sweep_number = np.repeat(np.arange(len(sweeps)), [len(cloud) for cloud in clouds.values()])
     recurs = _recurs(points, sweep_number, _REACH * neighbour_m)
     is_moving = ~_is_static(track, obstacles, clouds, sweep_number, neighbour_m)
-    # Half of the points within 0.5 m move too.
+    # Moving points of a bush lie among static points. Points of the object lie within 0.5 m of a
+    # point around which at least half of the points move.
     is_own = recurs & is_moving & close_to_seeds(points, is_moving, 0.5, 0.5)
     seed = np.concatenate([obstacles[j].seed[track.claimed[j]] for j in sweeps])
-    # The third kind: points with less than 10 % seeds around, hardly ever seen through
+    # The third kind of points has less than 10 % seeds around: it is hardly ever seen through.
     is_core = is_own & close_to_seeds(points, seed, _REACH * neighbour_m, 0.1)
     if is_core.any() and np.linalg.norm(np.ptp(points[is_core, :2], axis=0)) < _MAX_WALKER_M:
         return Shape.of(points[is_core])
@@ -106,7 +107,7 @@ def find_shape(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -
 
 
 def _recurs(points: Float, sweep_number: Int, reach_m: float) -> Bool:
-    """Return (N,) True for points near a point of a sweep of the other parity (even, odd)."""
+    """Return the (N,) mask of points near a point of a sweep of the other parity (even, odd)."""
     recurs = np.zeros(len(points), bool)
     for parity in (0, 1):
         is_same = sweep_number % 2 == parity
@@ -123,8 +124,7 @@ def _is_static(
     sweep_number: Int,
     reach_m: float,
 ) -> Bool:
-    """Return (N,) True for points that more other sweeps confirm as static than as moved."""
-    # clouds: N points by sweep index, object's frame; sweep_number: (N,) rank of each point's sweep
+    """Return the (N,) mask of points that more other sweeps confirm as static than as moved."""
     in_object = np.concatenate(list(clouds.values()))
     measured = np.concatenate([obstacles[j].points[track.claimed[j]] for j in clouds])
     low, high = measured.min(0) - reach_m, measured.max(0) + reach_m
@@ -148,28 +148,32 @@ def assign_points(
     obstacles: Sequence[Obstacles],
     space: FreeSpace,
 ) -> list[Instance]:
-    """Return, for each sweep of a batch, (N,) the index of each point's object, -1 for none."""
+    """Find the object of each point of a batch of sweeps.
+
+    Returns:
+        For each sweep (N,) int32, the index in ``objects``, -1 for points of no object.
+    """
     clouds = [SweepPoints.of(stretch, i, ground, obstacles[i], space.sensors) for i in batch]
     attached = [
         _attach(cloud, i, objects, space.clock) for i, cloud in zip(batch, clouds, strict=True)
     ]
-    # Vehicles are extended by the points of the whole batch at once.
+    # A batch is short, hence vehicles are extended by the points of all its sweeps at once.
     batch_instance = np.concatenate(attached)
     _extend_vehicles(batch_instance, SweepPoints.concatenate(clouds), batch[0], objects, space)
     instances = [np.full(len(stretch.sweeps[i].sweep), -1, np.int32) for i in batch]
-    begin = 0
-    for cloud, instance in zip(clouds, instances, strict=True):
-        instance[cloud.row] = batch_instance[begin : begin + len(cloud.row)]
-        begin += len(cloud.row)
+    ends = np.cumsum([len(cloud.row) for cloud in clouds])
+    parts = np.split(batch_instance, ends[:-1])
+    for cloud, instance, part in zip(clouds, instances, parts, strict=True):
+        instance[cloud.row] = part
     return instances
 
 
 def _attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: Clock) -> Instance:
-    """Return (N,) the index in ``objects`` of the nearest object at each point of a sweep, or -1.
+    """Return the index (N,) in ``objects`` of the object at each point of sweep i, -1 for none.
 
-    ``cloud`` holds the N points of sweep index i. A point belongs to an object if it lies near the
-    shape and at least 0.2 m above the ground, or inside the outline seen from above. Points less
-    than 0.1 m above the ground belong to no object of up to 2 m/s.
+    A point belongs to an object if it lies near the shape and at least 0.2 m above the ground, or
+    inside the outline seen from above. Points less than 0.1 m above the ground belong to no object
+    of up to 2 m/s. Of several objects the nearest owns the point.
     """
     instance = np.full(len(cloud.points), -1, np.int32)
     least_m = np.full(len(cloud.points), np.inf)
@@ -185,12 +189,11 @@ def _attach(cloud: SweepPoints, i: int, objects: Sequence[MovingObject], clock: 
         in_object = track.undo(cloud.points[rows], cloud.time_s[rows])
         distance_m, _ = nearest(shape.tree, in_object)
         # A point near the shape but below `ABOVE_GROUND_M` may be of the road. Inside the outline
-        # it is of the object, such as a wheel.
+        # such a point is of the object, for example of a wheel.
         belongs = (distance_m < cloud.reach_m[rows]) & (cloud.height_m[rows] >= ABOVE_GROUND_M)
         belongs |= shape.within_outline(in_object)
         if _speed_m_s(track, i, clock) <= _MAX_WALKER_SPEED_M_S:
             belongs &= cloud.height_m[rows] >= _MIN_WALKER_HEIGHT_M
-        # Of several objects the nearest one owns the point.
         is_nearest = belongs & (distance_m < least_m[rows])
         instance[rows[is_nearest]] = k
         least_m[rows[is_nearest]] = distance_m[is_nearest]
@@ -220,13 +223,14 @@ def _extend_vehicles(
         lane = moving_object.lane(at_s)
         middle = track.place(shape.points.mean(0, keepdims=True), at_s)[0]
         rows, along_m = _free_rows_in_lane(cloud, instance < 0, track, lane, middle, at_s)
-        # Only points that are linked with the object, by coordinates along the heading
+        # Only points that are linked with the object may belong to it. They are linked if their
+        # coordinates along the heading have no hole.
         members_at_one_time = track.carry(cloud.points[members], cloud.time_s[members], at_s)
         members_m = members_at_one_time[:, :2] @ lane.ahead
         columns_m = two_columns_m(middle, lane.ahead, space.T_lidar_world[i], space.sensors)
         hole_m = float(np.clip(columns_m, LINK_M, _LONGEST_HOLE_M))
         is_linked = _is_linked(along_m, members_m, hole_m)
-        # Of these, only points up to the first violations
+        # Of the linked points, only those up to the first violations are taken.
         if is_linked.any():
             linked_rows = rows[is_linked]
             ahead_m = along_m[is_linked] - np.median(members_m)
@@ -237,14 +241,14 @@ def _extend_vehicles(
 def _free_rows_in_lane(
     cloud: SweepPoints, is_free: Bool, track: Track, lane: Lane, middle: Float, at_s: float
 ) -> tuple[Int, Float]:
-    """Return the (K,) free rows of a cloud in a lane, and (K,) their coordinates along it (m)."""
-    # First fast and coarse tests: a box, and the lane widened by the motion within the batch
+    """Return the free rows (K,) of a cloud in a lane, and their coordinates (K,) along it (m)."""
+    # Fast and coarse tests come first: a box, and the lane widened by the motion within the batch
     reach_m = np.array([1.5 * LANE_M, 1.5 * LANE_M, np.inf])
     boxed_rows = cloud.strips.rows_inside(middle - reach_m, middle + reach_m)
     free_rows = boxed_rows[is_free[boxed_rows]]
     travel_m = float(np.linalg.norm(track.path.rate(at_s)[:2])) * np.ptp(cloud.time_s)
     near_rows = free_rows[lane.holds(cloud.points[free_rows], travel_m)]
-    # Then the exact test, with all points moved to one time
+    # The exact test needs all points moved to one time.
     at_one_time = track.carry(cloud.points[near_rows], cloud.time_s[near_rows], at_s)
     in_lane = lane.holds(at_one_time)
     return near_rows[in_lane], at_one_time[in_lane, :2] @ lane.ahead
@@ -256,7 +260,7 @@ def two_columns_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sen
     The side contains a point (3,) and runs along a unit vector ``ahead`` (2,), both world.
     """
     # Two columns, because one may lack returns. Two rays that differ by a small angle hit the side
-    # (angle x range² / distance of the side's line from the lidar) apart.
+    # at points that are angle x range² / (distance of the side's line from the lidar) apart.
     in_lidar = poses.transform(T_lidar_world, point[None])[0, :2]
     x, y = T_lidar_world[:2, :2] @ ahead
     aside_m = max(abs(float(in_lidar @ [-y, x])), 1e-3)
@@ -265,7 +269,7 @@ def two_columns_m(point: Float, ahead: Float, T_lidar_world: Float, sensors: Sen
 
 
 def _is_linked(along_m: Float, members_m: Float, hole_m: float) -> Bool:
-    """Return (N,) True for coordinates linked to ``members_m`` (M,) by steps up to ``hole_m``."""
+    """Return the mask of coordinates linked to ``members_m`` by steps of at most ``hole_m``."""
     all_m = np.concatenate([along_m, members_m])
     order = np.argsort(all_m, kind="stable")
     # Coordinates without a hole between them have the same run number.
@@ -277,30 +281,32 @@ def _is_linked(along_m: Float, members_m: Float, hole_m: float) -> Bool:
 def _is_unviolated(
     track: Track, cloud: SweepPoints, rows: Int, ahead_m: Float, i: int, space: FreeSpace
 ) -> Bool:
-    """Return (N,) True for extension points up to the first violations, ahead and behind."""
-    # ahead_m: (N,) metres ahead of the object's middle, negative behind
-    step = np.floor(np.abs(ahead_m) / LINK_M).astype(np.int64)
-    num_steps = int(step.max(initial=0)) + 1
-    step += num_steps * (ahead_m < 0)  # first the steps ahead, then the steps behind
+    """Return the (N,) mask of extension points up to the first violations, ahead and behind."""
+    # The lane is divided into bins of `LINK_M`, from the object to both sides.
+    bin_number = np.floor(np.abs(ahead_m) / LINK_M).astype(np.int64)
+    num_bins = int(bin_number.max(initial=0)) + 1
+    bin_number += num_bins * (ahead_m < 0)  # first the bins ahead, then the bins behind
 
-    def count_up_to(steps: Int) -> Int:  # (2,num_steps) points up to each step, ahead and behind
-        num_at = np.bincount(steps, minlength=2 * num_steps)
-        return num_at.reshape(2, num_steps).cumsum(axis=1)
+    def count_up_to(numbers: Int) -> Int:  # (2,num_bins) points up to each bin, ahead and behind
+        num_in_bin = np.bincount(numbers, minlength=2 * num_bins)
+        return num_in_bin.reshape(2, num_bins).cumsum(axis=1)
 
-    is_blocked = np.zeros((2, num_steps), bool)
+    is_blocked = np.zeros((2, num_bins), bool)
     in_object = track.undo(cloud.points[rows], cloud.time_s[rows])
     for j in space.others(i):
-        num_violations = count_up_to(step[track.seen_through(in_object, j, space)])
-        is_blocked |= num_violations > _MAX_VIOLATIONS * count_up_to(step)
-    # A violation also rejects all points behind it, as seen from the object.
+        num_violations = count_up_to(bin_number[track.seen_through(in_object, j, space)])
+        is_blocked |= num_violations > _MAX_VIOLATIONS * count_up_to(bin_number)
+    # A violation also rejects all points that are farther from the object.
     is_rejected = np.logical_or.accumulate(is_blocked, axis=1)
-    return np.asarray(~is_rejected.ravel()[step])
+    return np.asarray(~is_rejected.ravel()[bin_number])
 
 
 def is_tracked_at(track: Track, i: int, clock: Clock) -> bool:
     """Return True if sweep i is from 0.2 s before a track's first to 0.2 s after its last sweep."""
-    first, last = min(track.claimed), max(track.claimed)
-    return first <= i <= last or any(clock.near(i, end, MAX_MISSED_S) for end in (first, last))
+    first_sweep, last_sweep = min(track.claimed), max(track.claimed)
+    if first_sweep <= i <= last_sweep:
+        return True
+    return clock.near(i, first_sweep, MAX_MISSED_S) or clock.near(i, last_sweep, MAX_MISSED_S)
 
 
 def _speed_m_s(track: Track, i: int, clock: Clock) -> float:

@@ -25,10 +25,10 @@ from densify.geometry.types import Bool, Float, Int
 
 Bytes = NDArray[np.uint8]
 
-MAX_SPEED_M_S = 38.0
+MAX_SPEED_M_S = 38.0  # 137 km/h, greatest speed of the vote
 _NEAR_S, _AROUND_S = 0.1, 0.5  # times to the nearest and the farthest batches that vote
 STEP_M = 0.2  # side of a voxel
-_MOST_VOXELS = 1 << 28  # of a sweep, a byte each: 250 m x 250 m x 34 m
+_MOST_VOXELS = 1 << 28  # voxels of a sweep, a byte each: 250 m x 250 m x 34 m
 FEW_POINTS, _MANY_POINTS = 60, 600  # points of a cluster in the first vote, and in later votes
 
 
@@ -44,18 +44,18 @@ class DistanceField:
     @staticmethod
     def of(points: Float, time_s: Float) -> DistanceField:
         """Build the field of N > 0 candidates from points (N,3, world) and firing times (N,)."""
-        # The margin of the grid is wider than the reach of a candidate.
+        # A candidate reaches 0.6 m far. The margin of the grid is twice as wide.
         inside = points[bulk(points, STEP_M, _MOST_VOXELS)]
         low = inside.min(0) - 2 * LINK_M
         shape = tuple(np.ceil((inside.max(0) + 2 * LINK_M - low) / STEP_M).astype(int) + 1)
         nearness = np.zeros(shape, np.uint8)
-        # Offsets of the voxels around a candidate, and the nearness in them
-        reach = int(np.ceil(LINK_M / STEP_M))
-        span = np.arange(-reach, reach + 1)
+        # Offsets of the voxels around a candidate, and their nearness: 255 (1 - distance / 0.6 m)
+        num_voxels = int(np.ceil(LINK_M / STEP_M))  # to each side
+        span = np.arange(-num_voxels, num_voxels + 1)
         offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), -1).reshape(-1, 3)
-        distance = np.linalg.norm(offsets, axis=1) * STEP_M / LINK_M  # in units of the reach
-        is_reached = distance < 1
-        values = (255 - np.round(255 * distance[is_reached])).astype(np.uint8)
+        relative_distance = np.linalg.norm(offsets, axis=1) * STEP_M / LINK_M
+        is_reached = relative_distance < 1
+        values = (255 - np.round(255 * relative_distance[is_reached])).astype(np.uint8)
         _spread(inside, low, STEP_M, offsets[is_reached], values, nearness)
         return DistanceField(nearness, low, tree_of(points), time_s)
 
@@ -63,10 +63,10 @@ class DistanceField:
         """Raise ``nearness`` (V,N), in place, to that of a group's N points at V velocities.
 
         Nearness is from 0 (no candidate within 0.6 m) to 255. The points are moved at velocities
-        (V,3), m/s, world, to the time when this sweep fired at the new position.
+        (V,3), m/s, world, to the time when this sweep fired at their new position.
         """
-        # The firing time depends on the position, and the position on the time. Each is taken from
-        # the nearest candidate, first at the group's old position, then at the moved position.
+        # The firing time depends on the position, and the position on the time. The time is that of
+        # the nearest candidate: first at the group's old position, then at the moved position.
         _, old_neighbour = nearest(self.tree, group.middle[None])
         moved = group.middle + (self.time_s[old_neighbour] - group.middle_s) * velocities
         _, moved_neighbour = nearest(self.tree, moved)
@@ -100,7 +100,7 @@ class Group:
         return Group(points, time_s - middle_s, middle_s, points.mean(axis=0))
 
     def thinned(self, max_points: int) -> Group:
-        """Return the group with at most ``max_points`` points, evenly chosen."""
+        """Return the group with at most ``max_points`` of its points, chosen at equal steps."""
         step = len(self.points) // max_points + 1
         points = np.ascontiguousarray(self.points[::step])
         offset_s = np.ascontiguousarray(self.offset_s[::step])
@@ -108,20 +108,19 @@ class Group:
 
 
 def vote(group: Group, n: int, fields: Sequence[Sequence[DistanceField]], clock: Clock) -> Float:
-    """Return the horizontal velocity (3,), m/s, of a cluster of batch n that other sweeps support.
+    """Return the horizontal velocity (3,), m/s, that brings a cluster nearest to candidates.
 
-    At this velocity the group comes nearest to candidates of other batches, by the ``fields`` of
-    the sweeps of each batch. First the batches about 0.1 and 0.2 s before and after are compared,
-    in coarse steps of velocity. A flat side shows its speed only at its ends, which move by less
-    than a voxel in this short time. Therefore batches up to 0.5 s away are compared too, in fine
-    steps.
+    These are the candidates of batches around the cluster's batch n, in the ``fields`` of their
+    sweeps. First the batches about 0.1 and 0.2 s before and after are compared, in coarse steps of
+    velocity. A flat side shows its speed only at its ends, which move by less than a voxel in this
+    short time. Therefore batches up to 0.5 s away are compared too, in fine steps.
     """
     near_step_s = clock.num_in(_NEAR_S) * clock.period_ns * 1e-9
     # The farthest batches are two of these steps away.
     far_step_s = max(_AROUND_S / 2, near_step_s)
     near_fields = [fields[m] for m in _batches_around(n, near_step_s, clock)]
     all_fields = near_fields + [fields[m] for m in _batches_around(n, far_step_s, clock)]
-    # First vote: all velocities, in steps that move the group by two voxels
+    # First vote: all velocities, in steps that move the group by two voxels to the nearest batches
     few_points = group.thinned(FEW_POINTS)
     coarse_step_m_s = 2 * STEP_M / near_step_s
     coarse_grid = _grid(int(MAX_SPEED_M_S / coarse_step_m_s)) * coarse_step_m_s
@@ -145,7 +144,7 @@ def _batches_around(n: int, step_s: float, clock: Clock) -> list[int]:
 def _best_velocity(
     group: Group, fields: Sequence[Sequence[DistanceField]], velocities: Float
 ) -> Float:
-    """Return the velocity (3,) among (V,3) that brings the group nearest to candidates."""
+    """Return the one of ``velocities`` (V,3) that brings a group nearest to candidates."""
     cost = np.zeros(len(velocities))
     for batch_fields in fields:
         # A point counts once per batch, by the sweep in which it comes nearest to a candidate.
@@ -158,7 +157,7 @@ def _best_velocity(
 
 
 def _grid(num_steps: int) -> Float:
-    """Return all (V,3) horizontal steps with integer x and y, up to ``num_steps`` to each side."""
+    """Return the vectors (V,3) with whole x and y from -num_steps to num_steps, and z 0."""
     span = np.arange(-num_steps, num_steps + 1.0)
     x, y = np.meshgrid(span, span, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], 1)
@@ -168,7 +167,7 @@ def _grid(num_steps: int) -> Float:
 def _spread(
     points: Float, low: Float, step: float, offsets: Int, values: Bytes, grid: Bytes
 ) -> None:
-    """Raise the cells of ``grid`` at ``offsets`` (K,3) from points (N,3) to ``values`` (K,)."""
+    """Raise the voxels of ``grid`` at ``offsets`` (K,3) from points (N,3) to ``values`` (K,)."""
     for i in range(len(points)):
         x = int((points[i, 0] - low[0]) / step)
         y = int((points[i, 1] - low[1]) / step)
@@ -180,8 +179,8 @@ def _spread(
 
 @Kernel
 def _look_up(
-    first: int,
-    last: int,
+    first: int,  # first velocity of this thread
+    last: int,  # end of the velocities of this thread
     points: Float,  # (N,3) world
     offset_s: Float,  # (N,) firing times since the group's middle time
     velocities: Float,  # (V,3) m/s
@@ -189,14 +188,14 @@ def _look_up(
     low: Float,  # (3,) corner of the grid, world
     voxels_per_m: float,
     grid: Bytes,  # (X,Y,Z) nearness of the voxels
-    nearness: Bytes,
+    nearness: Bytes,  # (V,N) result
 ) -> None:
     """Raise ``nearness`` (V,N), in place, to the grid's at N points moved at V velocities."""
     num_x, num_y, num_z = grid.shape
     for v in range(first, last):
         for i in range(len(points)):
             # A point fired after the middle time has less time to move. Positions up to a voxel
-            # below the grid are truncated to voxel 0: it is in the margin, and has nearness 0.
+            # below the grid are truncated to voxel 0, which is in the margin and has nearness 0.
             moving_s = elapsed_s[v] - offset_s[i]
             x = int((points[i, 0] + velocities[v, 0] * moving_s - low[0]) * voxels_per_m)
             y = int((points[i, 1] + velocities[v, 1] * moving_s - low[1]) * voxels_per_m)
@@ -217,17 +216,21 @@ MAX_MISSED_S = 0.2  # time without points after which a track ends
 
 
 def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, Int]]:
-    """Return the clusters that may start a track: batch index, (K,) rows of the batch's obstacles.
+    """Return the clusters that may start a track, the largest first.
 
-    They have at least 8 points, 40 % of them seeds. The largest come first. A cluster nearer to an
-    end of the stretch than 0.5 s counts as smaller: fewer sweeps vote for its velocity.
+    Such a cluster has at least 8 points, 40 % of them seeds. Within 0.5 s of an end of the stretch
+    a cluster counts as smaller, because fewer sweeps vote for its velocity.
+
+    Returns:
+        For each cluster the batch index, and the (K,) rows of its points in the batch's obstacles.
     """
     starts = []
 
     def rank(start: tuple[int, Int]) -> float:
         n, members = start
-        nearer_s = max(0.0, _AROUND_S - clock.from_end_s(n))
-        return float(len(members) * 0.7 ** (nearer_s / _NEAR_S))
+        # Each 0.1 s without votes costs 30 % of the size.
+        missing_s = max(0.0, _AROUND_S - clock.from_end_s(n))
+        return float(len(members) * 0.7 ** (missing_s / _NEAR_S))
 
     for n, obstacles in enumerate(batches):
         cluster, candidate = obstacles.cluster, obstacles.candidate
@@ -241,11 +244,11 @@ def find_starts(batches: Sequence[Obstacles], clock: Clock) -> list[tuple[int, I
 
 @dataclass(frozen=True)
 class Follower:
-    """Tracker of clusters through the batches."""
+    """Tracker that follows a cluster from batch to batch."""
 
     batches: Sequence[Batch]  # groups of consecutive sweeps within 0.1 s
     is_free: Sequence[Bool]  # for each sweep (C,) True for obstacles that no track has claimed
-    ground: HeightMap
+    ground: HeightMap  # height of the ground, on which objects move
     clock: Clock  # times of the batches
 
     def follow(self, members: Int, start: int, velocity: Float) -> Track:
@@ -253,7 +256,7 @@ class Follower:
 
         The cluster is at rows ``members`` of the obstacles of batch ``start``. Its track starts at
         a velocity (3,), m/s, world. All points found so far, in the object's frame, are the model
-        that later points are aligned with.
+        with which the next points are aligned.
         """
         batch = self.batches[start]
         rate = np.append(velocity, 0.0)  # of the state, without a turn
@@ -275,7 +278,7 @@ class Follower:
         return track
 
     def _extend(self, track: Track, model: Model, rate: Float, n: int) -> bool:
-        """Add the object's points in batch n to both; False if too few points fit the model."""
+        """Add the object's points in batch n to track and model; False if too few points fit."""
         centre = track.centre
         batch = self.batches[n]
         obstacles = batch.obstacles
@@ -292,11 +295,11 @@ class Follower:
         rows = free_rows[obstacles.cluster[free_rows] >= 0]  # candidates
         min_num_rows = float(MIN_FIT)
         if len(rows) < MIN_FIT:
-            # No sweep saw through the object here, hence it has no candidates. Other obstacles are
-            # the object if they are at least half as many as usual.
-            usual_num = float(np.median([track.num_points(m) for m in track.observations]))
+            # No sweep saw through the object here, hence the object has no candidates. Other
+            # obstacles are taken if they are at least half as many as the object usually has.
+            usual_num_rows = float(np.median([track.num_points(m) for m in track.observations]))
             rows = free_rows
-            min_num_rows = max(MIN_FIT, usual_num / 2)
+            min_num_rows = max(MIN_FIT, usual_num_rows / 2)
         if len(rows) < min_num_rows:
             return False
 
@@ -320,17 +323,17 @@ class Follower:
 
 
 def _at_once(obstacles: Obstacles, rows: Int, rate: Float, time_s: float) -> Float:
-    """Return (N,3) obstacles ``rows`` moved to time ``time_s`` by the velocity ``rate[:3]``."""
-    offset_s = time_s - obstacles.time_s[rows]
-    return obstacles.points[rows] + offset_s[:, None] * rate[:3]
+    """Return the obstacles ``rows`` (N,), moved to one time by the velocity ``rate[:3]``."""
+    until_s = time_s - obstacles.time_s[rows]
+    return obstacles.points[rows] + until_s[:, None] * rate[:3]
 
 
 def _predict(
     track: Track, start_rate: Float, num_recent: int, time_s: float
 ) -> tuple[Float, Float, Float]:
-    """Predict state (4,), rate (4,) per second and std (3,) of x, y, yaw from the nearest states.
+    """Predict state (4,), rate (4,) per second and std (3,) of x, y (m), yaw (rad) at a time.
 
-    Speed and turn rate are constant.
+    Speed and turn rate are those of the nearest states, and constant.
     """
     # The velocity turns with the object (Schubert, Richter, Wanielik, "Comparison and Evaluation of
     # Advanced Motion Models for Vehicle Tracking", FUSION 2008).
@@ -340,19 +343,19 @@ def _predict(
     recent = dict(nearest_first[:num_recent])  # by batch index
     states = np.stack([observation.state for observation in recent.values()])
     times_s = np.array([observation.seen_s for observation in recent.values()])
-    ahead_s = time_s - times_s[0]
+    ahead_s = time_s - times_s[0]  # from the nearest state
     middle_s = times_s.mean()
     rate = start_rate
     if len(times_s) > 1:
-        # Slope of the least-squares line through the states. The velocity at which the track
-        # started counts as a further measurement while the first observation is among the recent
-        # ones. It says nothing about the turn rate.
+        # The slope of the least-squares line through the states is Σ t state / Σ t², with times t
+        # from their mean. The velocity at which the track started counts as a further measurement
+        # while the first observation is recent. This velocity says nothing about the turn rate.
         centred_s = times_s - middle_s
         first_batch = next(iter(track.observations))
         weight_s2 = np.full(4, _START_RATE_S2 * (first_batch in recent))
         weight_s2[3] = 0
         rate = (centred_s @ states + weight_s2 * start_rate) / (centred_s @ centred_s + weight_s2)
-        rate[3] *= 0.9  # turns end
+        rate[3] *= 0.9  # turns end, hence the turn rate falls
     std = PREDICTION_STD * max(1.0, abs(ahead_s) / _PREDICTION_S)
     # The slope is the rate at the mean time of the states. At constant turn rate, the mean rate
     # between the nearest state and ``time_s`` is the rate halfway between them.
@@ -361,7 +364,7 @@ def _predict(
 
 
 def _turn(rate: Float, duration_s: float) -> Float:
-    """Return the rate (4,) of a state after a time, at constant speed and turn rate."""
+    """Return the rate (4,) of a state after ``duration_s``, at constant speed and turn rate."""
     cos, sin = np.cos(rate[3] * duration_s), np.sin(rate[3] * duration_s)
     x, y = rate[:2]
     return np.array([cos * x - sin * y, sin * x + cos * y, *rate[2:]])

@@ -41,14 +41,14 @@ class GroupMotion:
     object_of_track: Int  # (K,) number of the object that each track belongs to
 
     def with_stretch(self, stretch: Stretch) -> GroupMotion:
-        """Return the same motion on another copy of its stretch, see `SharedMotion`."""
+        """Return the same motion on another copy of its stretch, such as one with points."""
         return replace(self, stretch=stretch)
 
     def flow(self, frame: int, target: int) -> FlowField:
         """Return the flow of all points of sweep ``frame`` to the reference time of ``target``.
 
-        It excludes ego-motion, and is in the lidar frame of ``frame``. Instances are numbers of
-        objects, not of tracks. Points are lost if the target is over 0.2 s before or after all
+        The flow excludes ego-motion, and is in the lidar frame of ``frame``. Instances are numbers
+        of objects, not of tracks. Points are lost if the target is over 0.2 s before or after all
         observations of their track.
         """
         i = self.stretch.frames.index(frame)
@@ -77,9 +77,8 @@ class GroupMotion:
             lost[rows] = not is_tracked_at(track, j, clock)
         # The last entry, at index -1, is for static points.
         instance = np.append(self.object_of_track, -1)[track_of_point].astype(np.int32)
-        return FlowField(
-            displacement, track_of_point >= 0, instance, lost, to_reference, velocity_m_s
-        )
+        moving = track_of_point >= 0
+        return FlowField(displacement, moving, instance, lost, to_reference, velocity_m_s)
 
 
 @dataclass(frozen=True)
@@ -90,10 +89,10 @@ class Bending:
     softened: Softened  # points of the object in each of these sweeps, and how the points bend
 
     def carry(self, i: int, j: int, clock: Clock, seen_s: Float) -> tuple[Float, Float]:
-        """Return sweep i's N points at the reference times of sweeps i and j: two (N,3) arrays.
+        """Return N points of sweep i at the reference times of sweeps i and j: two (N,3) arrays.
 
         Both are in the object's frame, in metres. ``seen_s`` (N,) are the points' firing times. An
-        object without points in sweep j bends as in the nearest sweep with some.
+        object without points in sweep j bends as in the nearest sweep with points.
         """
         source = self.sweeps.index(i)
         target = self.sweeps.index(clock.nearest(j, self.sweeps))
@@ -121,7 +120,7 @@ def find_group_motion(
 
     Args:
         scene: Registered sweeps. Points of batches without a sweep that is asked for stay static.
-        obstacles: For each sweep, its C points above the ground, and which may move.
+        obstacles: For each sweep, its C points above the ground, with the candidates.
         velocities_m_s: For each sweep, (C,3) approximate velocities of these points, world frame.
             None estimates them by a vote of neighbouring sweeps.
     """
@@ -173,10 +172,11 @@ def _find_bending(
 
 
 def _rows_by_track(track_of_point: Instance) -> list[tuple[int, Int]]:
-    """Return the index of each track with points, and their ascending indices."""
+    """Return the index of each track with points, and the ascending rows of these points."""
     rows = np.flatnonzero(track_of_point >= 0)
     rows = rows[np.argsort(track_of_point[rows], kind="stable")]
     tracks, begins = np.unique(track_of_point[rows], return_index=True)
+    # The first begin is 0, hence the first part is empty.
     return list(zip(tracks.tolist(), np.split(rows, begins)[1:], strict=True))
 
 
@@ -201,7 +201,7 @@ class _Piece(NamedTuple):
     near_m: dict[int, Float]  # sweep index -> (N,) neighbour distances
 
     def in_object(self, track: Track, sweeps: Sequence[int]) -> Float:
-        """Return the (N,3) points of some sweeps (by index) in the object's frame of a track."""
+        """Return the piece's points (N,3) in some sweeps (by index), object's frame of a track."""
         clouds = [track.undo(self.points[i], self.seen_s[i]) for i in sweeps]
         return np.concatenate([np.zeros((0, 3)), *clouds])
 
@@ -222,8 +222,8 @@ def join_pieces(
     pieces = _make_pieces(stretch, tracks, track_of_point, space)
     object_of_track, carrier_of_track = np.arange(len(tracks)), np.arange(len(tracks))
     num_points = {k: sum(map(len, piece.points.values())) for k, piece in pieces.items()}
-    # The piece with most points starts an object, which takes in pieces until none fits. The larger
-    # object may touch further pieces.
+    # The piece with most points starts an object. The object takes in pieces until none fits,
+    # because the larger object may touch further pieces.
     queue = sorted(pieces, key=lambda k: (-num_points[k], k))
     while queue:
         k = queue.pop(0)
@@ -260,7 +260,7 @@ def _has_own_motion(piece: _Piece, track: Track, space: FreeSpace) -> bool:
 def _make_pieces(
     stretch: Stretch, tracks: Sequence[Track], track_of_point: Sequence[Instance], space: FreeSpace
 ) -> dict[int, _Piece]:
-    """Return the piece of each track with points, by index in ``tracks``; see `join_pieces`."""
+    """Return the points of each track that has points, by index in ``tracks``."""
     pieces: dict[int, _Piece] = {}
     for i, registered in enumerate(stretch.sweeps):
         sweep = registered.sweep
@@ -276,7 +276,7 @@ def _make_pieces(
 def _is_part(
     piece: _Piece, moving_object: MovingObject, sweeps: set[int], space: FreeSpace
 ) -> bool:
-    """Return True if a piece belongs to an object that is observed in ``sweeps``."""
+    """Return True if a piece belongs to an object that has points in ``sweeps`` (by index)."""
     common = sorted(sweeps & piece.points.keys())
     if not common:
         return False
@@ -298,20 +298,15 @@ def _is_part(
     positions = piece.track.place(piece.in_object(piece.track, common), middle_s)
     compared = [i for i in common if space.clock.near(i, middle, _COMPARED_S)]
     ends_s = space.clock.time_s[[compared[0], compared[-1]]]
-    # Both tracks carry the points to nearly the same positions at both ends.
-    drift = [
-        track.carry(positions, middle_s, end_s) - piece.track.carry(positions, middle_s, end_s)
-        for end_s in ends_s
-    ]
     noise_m = _NUM_SIGMAS * np.hypot(track.path.residual_m, piece.track.path.residual_m)
-    drift_m = np.linalg.norm(np.concatenate(drift)[:, :2], axis=1).max()
-    if drift_m > tolerance_m + noise_m:
+    if _drift_m(track, piece.track, positions, middle_s, ends_s) > tolerance_m + noise_m:
         return False
-    # Rule 2: it also touches the object in most common sweeps.
+    # Rule 2: the piece also touches the object in most common sweeps.
     if is_touching:
         return True
-    # Rule 3: it is in the object's lane, ahead or behind, without a gap that shows two vehicles. A
-    # gap of up to 1.5 m may be a part without returns. Between two vehicles it is seen through.
+    # Rule 3: the piece is in the object's lane, ahead or behind, without a gap that shows two
+    # vehicles. A gap of up to 1.5 m may be a part without returns. Between two vehicles, such a gap
+    # is seen through.
     gap_m = _gap_in_lane_m(positions, moving_object, middle_s)
     if tolerance_m < gap_m <= _BUMPERS_M:
         in_object = track.undo(positions, middle_s)
@@ -319,8 +314,19 @@ def _is_part(
     return gap_m <= min(tolerance_m, _BUMPERS_M)
 
 
+def _drift_m(
+    track: Track, other_track: Track, positions: Float, from_s: float, ends_s: Float
+) -> float:
+    """Return the greatest horizontal distance (m) between points as two tracks carry them."""
+    offsets = [
+        track.carry(positions, from_s, end_s) - other_track.carry(positions, from_s, end_s)
+        for end_s in ends_s
+    ]
+    return float(np.linalg.norm(np.concatenate(offsets)[:, :2], axis=1).max())
+
+
 def _is_away(piece: _Piece, moving_object: MovingObject, i: int) -> bool:
-    """Return True if a piece is more than 1.5 m away from the box around an object in sweep i."""
+    """Return True if the boxes around a piece and an object are over 1.5 m apart in sweep i."""
     in_object = piece.in_object(moving_object.track, [i])
     rim = moving_object.shape.rim
     return bool(
@@ -341,14 +347,14 @@ def _touches(piece: _Piece, moving_object: MovingObject, sweeps: Sequence[int]) 
 
 
 def _lies_in_box(positions: Float, moving_object: MovingObject, at_s: float) -> bool:
-    """Return True if most of (N,3) positions at a time are in the box of an object."""
+    """Return True if most positions (N,3, world) at a time (s) are in the box of an object."""
     lane, along_m, object_along_m = _along_lane(positions, moving_object, at_s)
     is_beside = (along_m >= object_along_m.min()) & (along_m <= object_along_m.max())
     return bool((lane.holds(positions) & is_beside).mean() >= _MIN_SHARE)
 
 
 def _gap_in_lane_m(positions: Float, moving_object: MovingObject, at_s: float) -> float:
-    """Return the gap along the lane between an object and (N,3) points, infinite outside it."""
+    """Return the gap (m) along the lane from an object to positions, infinite outside the lane."""
     lane, along_m, object_along_m = _along_lane(positions, moving_object, at_s)
     if lane.holds(positions).mean() < _MIN_SHARE:
         return np.inf
@@ -358,7 +364,7 @@ def _gap_in_lane_m(positions: Float, moving_object: MovingObject, at_s: float) -
 def _along_lane(
     positions: Float, moving_object: MovingObject, at_s: float
 ) -> tuple[Lane, Float, Float]:
-    """Return an object's lane, and the coordinates along it of positions and object points."""
+    """Return an object's lane, and coordinates along it of positions and of the object's points."""
     lane = moving_object.lane(at_s)
     object_points = moving_object.track.place(moving_object.shape.points, at_s)
     return lane, positions[:, :2] @ lane.ahead, object_points[:, :2] @ lane.ahead
@@ -367,8 +373,8 @@ def _along_lane(
 def _is_seen_between(
     points: Float, moving_object: MovingObject, sweeps: Sequence[int], space: FreeSpace
 ) -> bool:
-    """Return True if a sweep saw through the middle between an object and (N,3) points."""
-    # Middle between the closest points of the piece and of the object, in the object's frame
+    """Return True if a sweep saw through the middle between an object and points of a piece."""
+    # The middle of the gap lies between the closest points of the piece and of the object.
     distance_m, neighbour = nearest(moving_object.shape.tree, points)
     closest = distance_m.argmin()
     ends = points[closest], moving_object.shape.points[neighbour[closest]]

@@ -22,7 +22,7 @@ from densify.free_space.range_image import REACH_S, FreeSpace
 from densify.geometry.nearest import is_near, nearest, tree_of
 from densify.geometry.types import Float
 
-NUM_ASKED = 60  # greatest number of tested points of a batch
+NUM_ASKED = 60  # greatest number of points of a batch whose positions are tested
 _PRIOR_COUNT = 5.0  # added to both counts of a ratio, because few observations are weak evidence
 _CLEARLY = 1.0  # difference of the log odds of two motions that exceeds noise
 _MIN_ROUGHNESS = 0.1  # accuracy of a state, as a share of the neighbour distance
@@ -37,7 +37,7 @@ class Places(NamedTuple):
     num_free: int  # number of positions in observed free space
 
     def log_occupied(self) -> float:
-        """Return the log odds that a position is occupied, near 0 for few observations."""
+        """Return the log odds that a position is occupied; few observations give almost 0."""
         return float(np.log((self.num_occupied + _PRIOR_COUNT) / (self.num_free + _PRIOR_COUNT)))
 
 
@@ -88,7 +88,7 @@ class Evidence(NamedTuple):
         }
 
     def log_odds(self, weights: Mapping[str, float]) -> float:
-        """Return the log odds that the track moves, by weights as those of `fitted_weights`."""
+        """Return the log odds to move; ``weights`` has a weight for each term, and ``price``."""
         terms = self.terms().items()
         return sum(weights[name] * value for name, value in terms) - weights["price"]
 
@@ -103,7 +103,7 @@ class Verdict(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """Return True if the track more likely moves than not."""
+        """Return True if the track moves more likely than not."""
         return self.log_odds > 0
 
     @property
@@ -116,6 +116,7 @@ class Verdict(NamedTuple):
         return other if self._is_clearly_below(other.log_odds) else self
 
     def _is_clearly_below(self, log_odds: float) -> bool:
+        """Return True if other log odds exceed this track's, and 0, by more than noise."""
         return log_odds > max(self.log_odds, 0.0) + _CLEARLY
 
 
@@ -126,7 +127,7 @@ def judge(
     objects: Sequence[MovingObject],
     record: RecordEvidence | None = None,
 ) -> Verdict:
-    """Return a smoothed track's log odds to move, minus infinity below 3 observations.
+    """Judge a smoothed track by the log odds that it moves, minus infinity below 3 observations.
 
     Args:
         obstacles: Points above the ground of each sweep of the stretch.
@@ -139,8 +140,9 @@ def judge(
     travel = (path(path.end_s) - path(path.begin_s))[:2]
     violations = count_violations(track, obstacles, space)
     neighbour_m = near_m(space.gap_m(track.centre, next(iter(track.claimed))))
-    # Observations at vacated positions cost most time. At first all are assumed to be free, which
-    # favours motion. They are counted only if the other terms do not reject the track even then.
+    # Observations at vacated positions cost most time. At first all positions are assumed to be
+    # free, which favours motion. The real observations are counted only if the other terms do not
+    # reject the track even under this assumption.
     all_free = Places(num_occupied=0, num_free=violations.tests)
     evidence = Evidence(
         violations=violations,
@@ -161,7 +163,7 @@ def judge(
 
 
 def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSpace) -> Violations:
-    """Count how often other sweeps see through sampled points of a track, as static and as moved.
+    """Count how often other sweeps see through points of a track, as static and as moved.
 
     At most 60 points of each batch are tested, by the first sweep of each other batch in reach.
     """
@@ -177,10 +179,10 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
     points = {i: obstacles[i].points[rows] for i, rows in tested_rows.items()}
     in_object = {i: track.in_object(obstacles[i], rows) for i, rows in tested_rows.items()}
 
-    static = moved = num_tests = 0
+    num_static = num_moved = num_tests = 0  # violations as static and as moved, and all tests
     for batch in space.batches:
         observer = batch[0]  # the first sweep stands for its batch
-        # Sweeps whose points this sweep can test
+        # Only sweeps within reach of the observer have points that it can test.
         sources = [i for i in tested_rows if observer in observers[i]]
         if not sources:
             continue
@@ -192,10 +194,10 @@ def count_violations(track: Track, obstacles: Sequence[Obstacles], space: FreeSp
         carried_m_s = track.velocity_m_s(carried, at_s)
         velocity_m_s = np.concatenate([carried_m_s, np.zeros_like(carried)])
         is_violated = space.seen_through(positions, observer, velocity_m_s)
-        moved += int(is_violated[: len(carried)].sum())
-        static += int(is_violated[len(carried) :].sum())
+        num_moved += int(is_violated[: len(carried)].sum())
+        num_static += int(is_violated[len(carried) :].sum())
         num_tests += len(carried)
-    return Violations(static, moved, num_tests)
+    return Violations(num_static, num_moved, num_tests)
 
 
 def _slenderness(points: Float, travel: Float, neighbour_m: float) -> float:
@@ -214,11 +216,14 @@ def count_vacated_places(
     objects: Sequence[MovingObject],
     within_m: float,
 ) -> tuple[Places, Places]:
-    """Count what other sweeps observed at an object's positions before it came, and after it left.
+    """Count what other sweeps observed where an object was, before it came and after it left.
 
-    Vacated positions are free if the object moved. A static wire fence can imitate this: it is seen
-    through from some directions only. Its vacated positions then hold returns of the fence. A
-    return within ``within_m`` occupies a position, unless it is of one of the other ``objects``.
+    Vacated positions are free if the object moved. A static wire fence, which is seen through from
+    some directions only, can imitate a moving object. Its vacated positions then hold returns of
+    the fence. A return within ``within_m`` occupies a position, unless it is of another object.
+
+    Returns:
+        The counts before the object came, and the counts after it left.
     """
     sweeps = list(track.claimed)
     samples = [
@@ -232,22 +237,22 @@ def count_vacated_places(
     rate = track.path.rate((track.path.begin_s + track.path.end_s) / 2)
     # Positions that the object left longer than `REACH_S` ago do not count.
     reach_m = LINK_M + REACH_S * float(np.linalg.norm(rate[:2]))
-    counts = np.zeros((2, 2), int)  # before and after, occupied and free
+    counts = np.zeros((2, 2), int)  # rows: before and after; columns: occupied and free
     for batch in space.batches:
-        first, last = batch[0], batch[-1]
-        in_object = track.undo(positions, space.clock.time_s[first])
+        first_sweep, last_sweep = batch[0], batch[-1]
+        in_object = track.undo(positions, space.clock.time_s[first_sweep])
         distance_m, _ = nearest(tree, in_object, reach_m)
-        # The distance is infinite beyond ``reach_m``. Positions measured in this batch itself are
-        # not vacated.
+        # A position is vacated if the object is away from it in this batch. The distance is
+        # infinite beyond ``reach_m``. Positions measured in this batch itself are not vacated.
         is_vacated = (distance_m > LINK_M) & np.isfinite(distance_m)
-        is_vacated &= (sweep_of_position < first) | (sweep_of_position > last)
+        is_vacated &= (sweep_of_position < first_sweep) | (sweep_of_position > last_sweep)
         if not is_vacated.any():
             continue
         vacated = positions[is_vacated]
-        is_after = sweep_of_position[is_vacated] < first  # the object has left already
+        is_after = sweep_of_position[is_vacated] < first_sweep  # the object has left already
         returns = [_returns_near(vacated, within_m, obstacles[j], objects) for j in batch]
         is_occupied = is_near(tree_of(np.concatenate(returns)), vacated, within_m)
-        is_free = space.seen_through(vacated, first) & ~is_occupied
+        is_free = space.seen_through(vacated, first_sweep) & ~is_occupied
         for row, at_row in enumerate((~is_after, is_after)):
             counts[row] += is_occupied[at_row].sum(), is_free[at_row].sum()
     before, after = counts.tolist()
@@ -257,7 +262,7 @@ def count_vacated_places(
 def _returns_near(
     positions: Float, reach_m: float, obstacles: Obstacles, objects: Sequence[MovingObject]
 ) -> Float:
-    """Return the (N,3) obstacles within ``reach_m`` of positions (M,3), world, of no object."""
+    """Return the (N,3) obstacles of no object within ``reach_m`` of positions (M,3), world."""
     rows = obstacles.strips.rows_inside(positions.min(0) - reach_m, positions.max(0) + reach_m)
     rows = rows[is_near(tree_of(positions), obstacles.points[rows], reach_m)]
     points, time_s = obstacles.points[rows], obstacles.time_s[rows]
@@ -271,5 +276,5 @@ def _returns_near(
 
 @cache
 def fitted_weights() -> Mapping[str, float]:
-    """Return the fitted weight of each term by its name, and the ``price``."""
+    """Return the fitted weight of each term of the log odds by its name, and the ``price``."""
     return read_json(Path(__file__).with_name("likelihood.json"))["weights"]

@@ -57,9 +57,9 @@ class Softened:
     held_out_m: dict[float, float]
 
     def velocity_m_s(self, i: int) -> Float:
-        """Return (n,3) velocities of snapshot i relative to the rigid motion, object's frame."""
-        # The mean of the velocities to the next and from the previous snapshot. On the way to the
-        # previous one both the displacement and the duration change their sign.
+        """Return velocities (n,3), m/s, of snapshot i without the rigid motion, object's frame."""
+        # The result is the mean of the velocities to the next and from the previous snapshot. To
+        # the previous snapshot both displacement and duration have the opposite sign.
         velocities = []
         for j in (i + 1, i - 1):
             if (i, j) in self.hops:
@@ -70,7 +70,7 @@ class Softened:
         return np.asarray(np.mean(velocities, axis=0))
 
     def carry(self, i: int, j: int) -> Float:
-        """Return the (n,3) points of snapshot i at the time of snapshot j, object's frame."""
+        """Return the points (n,3) of snapshot i at the time of snapshot j, object's frame."""
         points = self.snapshots[i].points
         if i == j or np.isinf(self.alpha):
             return points
@@ -88,7 +88,7 @@ class Softened:
 
 
 def soften(snapshots: Sequence[Snapshot]) -> Softened:
-    """Estimate how one object bends, from its snapshots by ascending time.
+    """Estimate how one object bends, from its points in each sweep by ascending time.
 
     Every second snapshot is held out, and predicted from its neighbours' bending. The softest
     stiffness is taken that lowers the mean squared error of the rigid object by more than 5 %, and
@@ -109,12 +109,12 @@ def soften(snapshots: Sequence[Snapshot]) -> Softened:
     if not len(confirmed):
         return Softened(snapshots, {}, np.inf, held_out_m)
     softest = int(confirmed[-1]) - 1  # column 0 is the rigid object
-    # Again with all snapshots, from the stiffest level down to the confirmed one
-    bending = _FlowSolver(snapshots)
-    for k in range(softest + 1):
-        bending.fill_targets()
-        bending.refine(k)
-    return Softened(snapshots, bending.at_points(), _ALPHAS[softest], held_out_m)
+    # Now all snapshots are used, from the stiffest level down to the confirmed level.
+    solver = _FlowSolver(snapshots)
+    for level in range(softest + 1):
+        solver.fill_targets()
+        solver.refine(level)
+    return Softened(snapshots, solver.at_points(), _ALPHAS[softest], held_out_m)
 
 
 def _may_bend(snapshots: tuple[Snapshot, ...]) -> bool:
@@ -128,26 +128,27 @@ def _may_bend(snapshots: tuple[Snapshot, ...]) -> bool:
 
 
 def _held_out_errors(snapshots: tuple[Snapshot, ...]) -> Float:
-    """Return the mean squared distance (m²) of each held-out snapshot from its prediction."""
+    """Return the mean squared distances (m²) of held-out snapshots from their predictions."""
     # Row i belongs to snapshot i + 1: the first and the last snapshot cannot be predicted. Column 0
     # is the rigid object, column k has alpha k - 1.
     squared_m2 = np.zeros((len(snapshots) - 2, 1 + len(_ALPHAS)))
     # Snapshots with even index predict those with odd index, and the other way round.
-    for first in (0, 1):
-        used = snapshots[first::2]
-        held_out = snapshots[first + 1 :: 2]
-        bending = _FlowSolver(used)
-        for k in range(1 + len(_ALPHAS)):
-            if k > 0:
-                bending.refine(k - 1)
+    for parity in (0, 1):
+        used = snapshots[parity::2]
+        held_out = snapshots[parity + 1 :: 2]
+        solver = _FlowSolver(used)
+        for column in range(1 + len(_ALPHAS)):
+            if column > 0:
+                solver.refine(level=column - 1)
             for n in range(len(used) - 1):
-                predicted = bending.between(n, held_out[n].time_s)
-                squared_m2[first + 2 * n, k] = _mean_squared_m2(held_out[n].points, predicted)
+                predicted = solver.between(n, held_out[n].time_s)
+                error_m2 = _mean_squared_m2(held_out[n].points, predicted)
+                squared_m2[parity + 2 * n, column] = error_m2
     return squared_m2
 
 
 def _mean_squared_m2(points: Float, predicted: Float) -> float:
-    """Return the mean squared, capped distance (m²) of nearest points, both ways."""
+    """Return the mean squared, capped distance (m²) of nearest points, in both directions."""
     to_predicted_m = np.minimum(nearest(tree_of(predicted), points)[0], FIT_M)
     to_points_m = np.minimum(nearest(tree_of(points), predicted)[0], FIT_M)
     return float((to_predicted_m**2).mean() + (to_points_m**2).mean()) / 2
@@ -157,24 +158,28 @@ class _FlowSolver:
     """Solver of the flow of nodes (points thinned by voxels) to the next and previous snapshot."""
 
     def __init__(self, snapshots: tuple[Snapshot, ...]) -> None:
+        """Prepare all that depends on the nodes alone, for snapshots by ascending time."""
         self._snapshots = snapshots
-        self._nodes = [
-            points[thinned(points, np.arange(len(points)), _NODE_M, 1)]
-            for points in (snapshot.points for snapshot in snapshots)
-        ]
+        self._nodes = []
+        for snapshot in snapshots:
+            order = np.arange(len(snapshot.points))
+            rows = thinned(snapshot.points, order, _NODE_M, max_per_cell=1)
+            self._nodes.append(snapshot.points[rows])
         # A hop (a, b) leads from snapshot a to the next or the previous snapshot b.
         last = len(snapshots) - 1
         self._hops = [(a, a + 1) for a in range(last)] + [(a, a - 1) for a in range(1, last + 1)]
         # All hops are solved at once. Their nodes are shifted apart along x by 10 m more than the
-        # object's extent, hence neighbours are always of the same hop.
+        # object's extent, farther than a blur reaches: only neighbours of the same hop count.
         extent_m = float(np.ptp(np.concatenate(self._nodes), axis=0).max())
         self._shift_m = extent_m + 10.0
         # Index of the first node of each hop, and after the last hop the number of all nodes
         self._begins = np.cumsum([0] + [len(self._nodes[a]) for a, _ in self._hops])
         self._source = self._side_by_side([self._nodes[a] for a, _ in self._hops])
         self._target = self._side_by_side([self._nodes[b] for _, b in self._hops])
-        self._flow = np.zeros_like(self._source)  # (nodes, 3) relative to the rigid motion
-        # These depend on the source nodes only, and serve all levels.
+        # (nodes, 3) flow of each node relative to the rigid motion, which `refine` updates
+        self._flow = np.zeros_like(self._source)
+        # The following matrices depend on the source nodes only, and serve all levels. On a surface
+        # 6 neighbours surround a node. Beyond 0.5 m they would be of another part of the object.
         weights = knn_graph(self._source, num_neighbors=6, within_m=0.5)
         degree = weights.sum(axis=1)
         self._laplacian = csr_array((diags_array(degree) - weights) / degree.mean())
@@ -182,9 +187,9 @@ class _FlowSolver:
         self._velocity_penalty = self._velocity_penalty_matrix()
 
     def refine(self, level: int) -> None:
-        """Match all nodes again, and solve for the flow of a level, in place; 0 is the stiffest."""
-        # Minimise, for fixed target flows t with weights w:
-        # Σ w |f - t|² + Σ a |f|² + velocity penalty + alpha tr(Fᵀ L F)
+        """Match all nodes, and update their flow at ``_ALPHAS[level]``; level 0 is the stiffest."""
+        # With fixed target flows t and weights w the flow F of rows f minimises
+        #   Σ w |f - t|² + Σ a |f|² + velocity penalty + alpha tr(Fᵀ L F)
         # The anchor a holds a node until it clearly left the rigid position (Geman, McClure 1987).
         target_flow, weight = self._match(level)
         anchor = _ANCHOR / (1 + (self._flow**2).sum(axis=1) / _ANCHOR_M**2) ** 2
@@ -193,18 +198,18 @@ class _FlowSolver:
         self._solve(matrix, weight[:, None] * target_flow)
 
     def _match(self, level: int) -> tuple[Float, Float]:
-        """Return the flow of each node (nodes, 3) to its target, and the (nodes,) weights."""
+        """Return the flow (nodes, 3) of each node to its target, and weights (nodes,), 0 to 1."""
         moved = self._source + self._flow
         neighbours = nearest_k(tree_of(self._target), moved, _NUM_BLURRED)[1]
         target_mean, distance_m = _blur(self._target, neighbours, moved, _BLURS_M[level])
-        # A mean is biased towards the inside at an edge or beside a hole. The bias of the object's
-        # own mean is the same, and cancels.
+        # At an edge or beside a hole, a mean is biased towards the inside. The mean of the object's
+        # own nodes has the same bias, hence the difference of both has none.
         source_mean, _ = _blur(moved, self._neighbours, moved, _BLURS_M[level])
         weight = np.clip(1 - (distance_m / _REACHES_M[level]) ** 2, 0, 1) ** 2  # Tukey
         return self._flow + target_mean - source_mean, weight
 
     def _solve(self, matrix: csr_array, right_side: Float) -> None:
-        """Solve for the flow, in place, by conjugate gradients with a Jacobi preconditioner."""
+        """Solve ``matrix`` · flow = ``right_side`` roughly, in place, by conjugate gradients."""
         jacobi = diags_array(1 / (matrix.diagonal() + 1e-9))
         for axis in range(3):
             start, right = self._flow[:, axis], right_side[:, axis]
@@ -228,7 +233,7 @@ class _FlowSolver:
         self._target = self._side_by_side(targets)
 
     def between(self, i: int, time_s: float) -> Float:
-        """Return the (N,3) nodes of snapshots i and i + 1, both moved to a time between them."""
+        """Return the nodes (N,3) of snapshots i and i + 1, both moved to a time between them."""
         flows = self._by_hop()
         begin_s, end_s = self._snapshots[i].time_s, self._snapshots[i + 1].time_s
         share = (time_s - begin_s) / (end_s - begin_s)
@@ -237,7 +242,7 @@ class _FlowSolver:
         return np.concatenate([earlier, later])
 
     def at_points(self) -> dict[tuple[int, int], Float]:
-        """Return the flow (n,3) of the points of each hop."""
+        """Return the flow (n,3) of the points of each hop, metres, by (a, b)."""
         points = [snapshot.points for snapshot in self._snapshots]
         flows = {}
         for (a, b), flow in self._by_hop().items():
@@ -253,24 +258,23 @@ class _FlowSolver:
         return averaged
 
     def _by_hop(self) -> dict[tuple[int, int], Float]:
-        """Return the flow (n,3) of the nodes of each hop."""
+        """Return the flow (n,3) of the nodes of each hop, metres, by (a, b)."""
         return dict(zip(self._hops, np.split(self._flow, self._begins[1:-1]), strict=True))
 
     def _side_by_side(self, clouds: Sequence[Float]) -> Float:
-        """Return the clouds (n,3) of all hops, each shifted to its own place along x."""
+        """Return the clouds (n,3) of all hops as one array, each shifted to a place along x."""
         return np.concatenate(
             [cloud + [k * self._shift_m, 0.0, 0.0] for k, cloud in enumerate(clouds)]
         )
 
     def _velocity_penalty_matrix(self) -> csr_array:
         """Return the (nodes, nodes) matrix of ``|f_next / dt_next + f_before / dt_before|²``."""
-        # f: displacements of a node to the next and the previous snapshot. At constant velocity
-        # they have opposite signs, and the sum is 0. The square has a term f² / dt² for each hop
-        # (the diagonal), and a mixed term of both (the coupling).
+        # At constant velocity both displacements have opposite signs, and the sum is 0. The square
+        # has a term f² / dt² for each hop (the diagonal), and a mixed term (the coupling).
         hop_numbers = {hop: k for k, hop in enumerate(self._hops)}
         times_s = [snapshot.time_s for snapshot in self._snapshots]
         row = np.arange(len(self._source))
-        # Row of the same node in the hop to the other side. Without such a hop it is the node's own
+        # Row of the same node in the hop to the other side. A node without such a hop has its own
         # row, with weight 0.
         opposite_row = row.copy()
         diagonal, coupling = np.zeros((2, len(row)))
@@ -292,12 +296,12 @@ class _FlowSolver:
 
 
 def _blur(points: Float, neighbours: Int, positions: Float, blur_m: float) -> tuple[Float, Float]:
-    """Return (N,3) Gaussian means of each position's neighbours, and (N,) nearest distances."""
+    """Return the Gaussian means (N,3) of each position's neighbours, and nearest distances (N,)."""
     neighbour_points = points[neighbours]
     offset = neighbour_points - positions[:, None]
     squared = np.einsum("nki,nki->nk", offset, offset)
     nearest_squared = squared.min(axis=1)
-    # Relative to the nearest neighbour, hence the weights never all vanish
+    # Relative to the nearest neighbour, whose weight is 1: the sum is never 0.
     weight = np.exp((nearest_squared[:, None] - squared) / (2 * blur_m**2))
     weight /= weight.sum(axis=1, keepdims=True)
     return np.einsum("nk,nki->ni", weight, neighbour_points), np.sqrt(nearest_squared)
@@ -310,11 +314,11 @@ def _interpolate(
     sample_displacement: Float,
     values: Float,
 ) -> Float:
-    """Return (N,3) values at points from (M,3) samples of similar position and displacement."""
+    """Return the values (N,3) at points, from M samples of similar position and displacement."""
     samples = np.hstack([sample_points, sample_displacement])
     queries = np.hstack([points, displacement])
     neighbours = nearest_k(tree_of(samples), queries, 3)[1]
     distance_m = np.linalg.norm(samples[neighbours] - queries[:, None], axis=2)
-    weight = 1 / (distance_m + 1e-3) ** 2
+    weight = 1 / (distance_m + 1e-3) ** 2  # 1 mm avoids a division by 0
     weight /= weight.sum(axis=1, keepdims=True)
     return np.einsum("nk,nki->ni", weight, values[neighbours])

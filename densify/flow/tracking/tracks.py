@@ -82,13 +82,14 @@ class _Search:
         self._free = [np.ones(len(sweep.points), bool) for sweep in obstacles]
         self._objects = list[MovingObject]()
         self._follower = Follower(self.batches, self._free, ground, self.clock)
-        # For each batch, the fields of its sweeps with candidates
+        # For each batch, the fields of its sweeps with candidates; empty if no vote is needed
         self._fields: list[list[DistanceField]] = []
-        for batch in self.batches if velocities_m_s is None else ():
-            sweeps = [obstacles[j] for j in batch.sweeps if obstacles[j].candidate.any()]
-            self._fields.append(
-                [DistanceField.of(s.points[s.candidate], s.time_s[s.candidate]) for s in sweeps]
-            )
+        if velocities_m_s is None:
+            for batch in self.batches:
+                sweeps = [obstacles[j] for j in batch.sweeps if obstacles[j].candidate.any()]
+                self._fields.append(
+                    [DistanceField.of(s.points[s.candidate], s.time_s[s.candidate]) for s in sweeps]
+                )
 
     def find_tracks(self) -> list[Track]:
         """Return the confirmed tracks; tracks from the best starting clusters come first."""
@@ -100,8 +101,9 @@ class _Search:
             members = cluster[is_available]
             if len(members) < MIN_POINTS:
                 continue
-            starting = [self._likely_velocity(members, n), *self._nearby_velocities(members, n)]
-            velocities = [v for v in starting if self._may_move(members, n, v)]
+            # Velocities start a track only if they lower the number of violations, if any.
+            proposed = [self._likely_velocity(members, n), *self._nearby_velocities(members, n)]
+            velocities = [velocity for velocity in proposed if self._may_move(members, n, velocity)]
             if not velocities:
                 continue
             verdict = self._track_of(members, n, velocities)
@@ -112,7 +114,7 @@ class _Search:
         return [track for track, _ in self._objects]
 
     def _confirm(self, track: Track) -> None:
-        """Add a confirmed track to the objects, with all points that its motion explains."""
+        """Add a confirmed track to the objects, and claim all points that its motion explains."""
         self._claim_nearby(track)
         _realign(track, self._obstacles, self._ground)
         self._claim_in_lane(track)
@@ -121,7 +123,7 @@ class _Search:
         self._objects.append(MovingObject(track, self._shape_of(track)))
 
     def _nearby_velocities(self, members: Int, n: int) -> Iterator[Float]:
-        """Yield the velocity (3,), m/s, of each object within 1 m of batch n's ``members``."""
+        """Yield the velocity (3,), m/s, of each object within 1 m of ``members`` of batch n."""
         # A trailer has the velocity of the car that tows it. The measurements alone hardly show how
         # fast a long flat side moves along itself.
         points = self.batches[n].obstacles.points[members]
@@ -193,7 +195,7 @@ class _Search:
         return best
 
     def _follow(self, members: Int, n: int, velocity: Float) -> Verdict:
-        """Return the track of ``members`` of batch n's obstacles from a velocity (3,), m/s."""
+        """Follow ``members`` of batch n from a velocity (3,), m/s, and judge the track."""
         track = self._follower.follow(members, n, velocity)
         if len(track.observations) > 1:
             track.smooth()
@@ -201,7 +203,7 @@ class _Search:
 
     def _claim_nearby(self, track: Track) -> None:
         """Claim free candidates in or near the object that its motion explains, in place."""
-        # Unclaimed points of the object would start a track of their own.
+        # Without this step, unclaimed points of the object would start a track of their own.
         shape = self._shape_of(track)
         for j, claimed in track.claimed.items():
             rows = self._unclaimed_around(track, shape, j, LINK_M)
@@ -211,8 +213,8 @@ class _Search:
     def _claim_in_lane(self, track: Track) -> None:
         """Claim free clusters of single rings or columns ahead of and behind the object."""
         # On a roof, or on a side that recedes from the scanner, neighbouring rings or columns are
-        # too far apart to be linked. Such a cluster would seem static if it was tracked alone: the
-        # ray that hits the passing side stays where it is.
+        # too far apart to be linked. A cluster of one ring or column would seem static if it was
+        # tracked alone: the ray that hits the passing side stays where it is.
         space = self._space
         shape = self._shape_of(track)
         at_s = next(iter(track.observations.values())).seen_s
@@ -249,7 +251,7 @@ class _Search:
         return self._drop_violations(track, j, rows)
 
     def _unclaimed_around(self, track: Track, shape: Shape, j: int, margin_m: float) -> Int:
-        """Return the rows of sweep j's free candidates within a margin of an object's box."""
+        """Return the rows of free candidates of sweep j within a margin of an object's box."""
         obstacles = self._obstacles[j]
         rim = track.place(shape.rim, track.seen_at(self._space.clock.time_ns[j]))
         rows = obstacles.strips.rows_inside(rim.min(0) - margin_m, rim.max(0) + margin_m)
@@ -257,7 +259,7 @@ class _Search:
         return np.setdiff1d(rows, track.claimed[j], assume_unique=True)
 
     def _drop_violations(self, track: Track, j: int, rows: Int) -> Int:
-        """Return those ``rows`` of sweep j that, moved with the track, are never seen through."""
+        """Return ``rows`` of sweep j but those that, moved with the track, are seen through."""
         for i in self._space.others(j):
             if self._space.clock.near(i, j, _NEAR_S) and len(rows):
                 in_object = track.in_object(self._obstacles[j], rows)
@@ -268,14 +270,14 @@ class _Search:
 def _is_of_few_rays(
     obstacles: Obstacles, rows: Int, T_lidar_world: Float, sensors: Sensors
 ) -> Bool:
-    """Return (N,) True for ``rows`` whose cluster is hit by a single ring or column."""
+    """Return the (N,) mask of ``rows`` (N,) whose cluster is hit by a single ring or column."""
     if not len(rows):
         return np.zeros(0, bool)
     # All points of the clusters count, also those that are not in ``rows``.
     clusters, cluster_of_row = np.unique(obstacles.cluster[rows], return_inverse=True)
-    is_asked = np.zeros(obstacles.num_clusters + 1, bool)  # the last one for cluster -1
-    is_asked[clusters] = True
-    members = np.flatnonzero(is_asked[obstacles.cluster])
+    is_in_rows = np.zeros(obstacles.num_clusters + 1, bool)  # the last entry is for cluster -1
+    is_in_rows[clusters] = True
+    members = np.flatnonzero(is_in_rows[obstacles.cluster])
     label = obstacles.cluster[members]
     in_lidar = poses.transform(T_lidar_world, obstacles.points[members])
 
@@ -290,20 +292,21 @@ def _is_of_few_rays(
     # Azimuths relative to the mean direction, which keeps them away from the jump at 180 degrees
     x, y = in_lidar[:, :2].mean(axis=0)
     azimuth_rad = np.arctan2(in_lidar[:, :2] @ [-y, x], in_lidar[:, :2] @ [x, y])
-    is_single = spread(np.arcsin(in_lidar[:, 2] / range_m)) < _ONE_RING * np.asarray(ring_rad)
+    elevation_rad = np.arcsin(in_lidar[:, 2] / range_m)
+    is_single = spread(elevation_rad) < _ONE_RING * np.asarray(ring_rad)
     is_single |= spread(azimuth_rad) < _ONE_COLUMN * column_rad
     return np.asarray(is_single[cluster_of_row.ravel()])
 
 
 def _realign(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) -> None:
-    """Align every observation again, in place; keep the result if the motion is smoother."""
+    """Align every observation of a track again, in place, if this makes the motion smoother."""
     # Followed batch by batch, an object drifts when its other side comes into view. Therefore even
     # batches are aligned with the points of the odd batches, and the other way round: points are
     # never aligned with themselves.
-    sweeps: tuple[list[int], list[int]] = [], []  # of the even batches, of the odd batches
+    even_sweeps, odd_sweeps = list[int](), list[int]()  # sweeps of the even and odd batches
     for n, observation in sorted(track.observations.items()):
-        sweeps[n % 2].extend(observation.sweeps)
-    clouds = [track.points_in(obstacles, parity_sweeps) for parity_sweeps in sweeps]
+        (odd_sweeps if n % 2 else even_sweeps).extend(observation.sweeps)
+    clouds = [track.points_in(obstacles, sweeps) for sweeps in (even_sweeps, odd_sweeps)]
     if not all(map(len, clouds)):
         return  # observed in batches of one parity only
     models = [Model(cloud) for cloud in clouds]
@@ -311,9 +314,10 @@ def _realign(track: Track, obstacles: Sequence[Obstacles], ground: HeightMap) ->
     previous_path = track.path
     for n, observation in track.observations.items():
         points = track.points_in(obstacles, observation.sweeps)
-        target = track.place(points, observation.seen_s)
+        positions = track.place(points, observation.seen_s)
         predicted = track.path(observation.seen_s)
-        state = models[1 - n % 2].align(target, track.centre, predicted, _PATH_STD)
+        other_model = models[1 - n % 2]
+        state = other_model.align(positions, track.centre, predicted, _PATH_STD)
         if state is not None:
             state[2] = track.rise_m(ground, state)
             track.observations[n] = replace(observation, state=state)
