@@ -139,8 +139,7 @@ def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure:
     """Return the pixel coordinates where rays cross the surface of a map clearly before they end.
 
     The search starts at the end of the ray. A step goes to the point of the ray at the surface's
-    depth in the present pixel. Steps are repeated until the depth stays the same. The result (P,2)
-    has columns and rows in px of the P rays that cross the surface.
+    depth in the present pixel. Steps repeat until the depth stays the same. Returned are (P,2) px.
 
     Args:
         surface_m: (H,W) depth of the surface in metres, 0 for none.

@@ -91,8 +91,7 @@ def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float,
     """Return where lines, start + t · direction, enter a convex body and where they leave the body.
 
     The body has the sides (F,4) of `half_spaces`. Lines start at (K,3), or all at (3,). Directions
-    (K,3) have any length. Returned are t (K,) of entering and t (K,) of leaving, which is less than
-    t of entering if the line misses the body.
+    (K,3) have any length. Returned are t (K,) of entering and of leaving, less if a line misses.
     """
     enter, leave = np.full(len(direction), -np.inf), np.full(len(direction), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):

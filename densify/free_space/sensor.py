@@ -241,8 +241,7 @@ class SensorModel(Layout):
         """Return the gap from points (N,3), lidar frame, to the next ring, and which are in view.
 
         Returns:
-            gap_m: (N,) metres at the point's range: spacing of rings, or of rays without rings,
-                plus the width of a beam.
+            gap_m: (N,) metres at the point's range: spacing of rings or rays, plus a beam's width.
             in_view: (N,) True for points within the field of view.
         """
         ray = points - self.origin_m
@@ -276,7 +275,7 @@ class Sensors:
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return the distances (N,) in m from points to the next ring of their scanner ``lidar``."""
+        """Return the gaps (N,) in m from points, lidar frame, to the next ring of their scanners."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             rows = np.flatnonzero(lidar == number)
