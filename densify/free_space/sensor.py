@@ -275,7 +275,7 @@ class Sensors:
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return the gaps (N,) in m from points, lidar frame, to the next ring of their scanners."""
+        """Return gaps (N,) in m from points, lidar frame, to the next ring of their scanners."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             rows = np.flatnonzero(lidar == number)
