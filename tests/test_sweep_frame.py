@@ -10,7 +10,7 @@ import pytest
 
 from densify.config import resolve
 from densify.config.errors import InputError
-from densify.free_space.raw_sweeps import are_placed, is_still, way_in_map
+from densify.free_space.raw_sweeps import is_still, rays_begin_at_poses, way_in_map
 from densify.geometry import poses
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
@@ -59,8 +59,8 @@ def test_sweeps_at_their_poses_are_placed(street, placed):
     T_world_map = np.eye(4)
     T_world_map[:3, 3] = 30.0, -20.0, 0.5
     moved = [replace(s, points=poses.transform(T_world_map, s.points)) for s in sweeps]
-    assert are_placed(moved, T_world_map @ T)
-    assert not are_placed([street[FIRST], street[LAST]], T_world_map @ T)
+    assert rays_begin_at_poses(moved, T_world_map @ T)
+    assert not rays_begin_at_poses([street[FIRST], street[LAST]], T_world_map @ T)
 
 
 def test_sweeps_in_the_frame_of_a_map_are_refused_with_the_remedy(placed, street, tmp_path):

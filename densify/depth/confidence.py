@@ -49,70 +49,74 @@ _UNCONFIRMED = 2.7
 
 
 def features(record: MapRecord, since_key_ns: Int, camera: Camera) -> Float32:
-    """Return the (P,10) features of the P pixels with a filled or rejected depth, row by row.
+    """Return the features of the pixels with a filled or rejected depth.
 
     Shares, steps and ages enter by their logarithm to base 10, because probabilities of errors are
     proportional to powers of them. The step is the logarithm of the ratio of the greatest to the
     least depth around, as a multiple of the tolerance of KITTI's rule. Age and discontinuity are
-    those of the nearest measured pixel, before `densify.depth.fill.measure_spots`. A moving body
-    has no discontinuity. Spacings are those of neighbouring rays. ``since_key_ns`` (M,) are the
-    times of the cloud's points since the key sweep.
+    those of the nearest pixel with a return. A moving body has no discontinuity. Spacings are those
+    of neighbouring rays. ``since_key_ns`` (M,) are the times of the cloud's points since the key.
+    Filled pixels under laser spots must not count as measured yet. The result (P,10) has the pixels
+    row by row, and the features in the order of `WEIGHTS`.
     """
-    shown, rejected = record.filled_m > 0, record.rejected_m > 0
-    has_depth = shown | rejected
-    depth_m = np.where(shown, record.filled_m, record.rejected_m)
-    measured = record.depth_m > 0
+    has_filled, is_rejected = record.filled_m > 0, record.rejected_m > 0
+    has_depth = has_filled | is_rejected
+    depth_m = np.where(has_filled, record.filled_m, record.rejected_m)
+    is_measured = record.depth_m > 0
     gap_px = float(np.median(record.gap_px))
 
     # Of the nearest measured pixel
-    nearest = nearest_pixel(measured)
-    age_s = np.abs(since_key_ns[record.point[nearest]]) * 1e-9 if measured.any() else 0 * depth_m
-    edge = np.where(measured, record.edge, 0)[nearest]
-    edge[record.on_body] = ALL_ROUND
+    nearest = nearest_pixel(is_measured)
+    age_s: Float | Float32 = np.zeros_like(depth_m)
+    if is_measured.any():
+        age_s = np.abs(since_key_ns[record.point[nearest]]) * 1e-9
+    edge_distance = np.where(is_measured, record.edge, 0)[nearest]
+    edge_distance[record.on_body] = ALL_ROUND
 
     # Of the pixels around, without those outside the image
     step = _log_step(depth_m, record.filled_m, _window_px(1, gap_px)) / tolerance(depth_m, camera)
-    cover_px = _window_px(2, gap_px)
-    cover = _mean(shown, cover_px) / _mean(np.ones_like(shown), cover_px)
-    columns = [
-        np.ones(shown.shape),
-        ~measured,
-        _logarithm(1 - record.votes, _LEAST_VOTES),
-        _log_rejected_share(record, _window_px(2, gap_px)),
-        _log_rejected_share(record, _window_px(8, gap_px)),
-        _logarithm(step, _LEAST_STEP),
-        _logarithm(age_s, _LEAST_AGE_S),
-        -np.log2(np.maximum(cover, _LEAST_COVER)),
-        np.clip(ALL_ROUND - edge, 0, ALL_ROUND - 1),
-        rejected,
-    ]
-    return np.stack([column[has_depth] for column in columns], axis=1).astype(np.float32)
+    window_px, wide_window_px = _window_px(2, gap_px), _window_px(8, gap_px)
+    share_in_image = _mean(np.ones_like(has_filled), window_px)
+    share_with_depth = np.maximum(_mean(has_filled, window_px) / share_in_image, _LEAST_COVER)
+    columns: dict[str, NDArray[Any]] = {
+        "every pixel": np.ones(has_filled.shape),
+        "filled pixel": ~is_measured,
+        "votes of the image against the depth": _logarithm(1 - record.votes, _LEAST_VOTES),
+        "rejected boundary pixels within 2 spacings": _log_rejected_share(record, window_px),
+        "rejected boundary pixels within 8 spacings": _log_rejected_share(record, wide_window_px),
+        "step of depth within a spacing": _logarithm(step, _LEAST_STEP),
+        "age": _logarithm(age_s, _LEAST_AGE_S),
+        "pixels without a depth within 2 spacings": -np.log2(share_with_depth),
+        "nearness of a depth discontinuity": np.clip(ALL_ROUND - edge_distance, 0, ALL_ROUND - 1),
+        "rejected pixel": is_rejected,
+    }
+    return np.stack([columns[name][has_depth] for name in WEIGHTS], axis=1).astype(np.float32)
 
 
 def nearest_pixel(mask: Bool) -> tuple[Int, Int]:
-    """Return the (H,W) rows and the (H,W) columns of the nearest True pixel of each pixel."""
+    """Return the row (H,W) and the column (H,W) of the True pixel nearest to each pixel."""
     row, column = ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True)
     return row, column
 
 
 def tolerance(depth_m: Float32, camera: Camera) -> Float:
-    """Return the error from which depths ``depth_m`` (m) are outliers, as shares of the depths."""
+    """Return the relative errors from which depths in metres are outliers by KITTI's rule."""
     px = depth_m.astype(np.float64) / (camera.focal_px * KITTI_BASELINE_M)
     return np.maximum(OUTLIER_PX * px, OUTLIER_FRACTION)
 
 
 def _logarithm(values: Float | Float32, least: float) -> Float:
-    """Return log10(1 + values / least): values from 0, those below ``least`` are close to 0."""
+    """Return log10(1 + values / least), which is close to 0 for values below ``least``."""
     return np.log10(values / least + 1)
 
 
 def _window_px(spacings: float, gap_px: float) -> int:
-    """Return the width in pixels of a window that reaches so many spacings to all sides."""
+    """Return the width in pixels of a window that reaches ``spacings`` times ``gap_px`` around."""
     return 2 * max(2, round(spacings * gap_px)) + 1  # the central pixel, and as many on each side
 
 
 def _mean(mask: Bool, size_px: int) -> Float32:
-    """Return the (H,W) share of the mask in the window around each pixel; outside it is False."""
+    """Return the (H,W) share of the mask in the window around each pixel, False outside."""
     return ndimage.uniform_filter(mask.astype(np.float32), size_px, mode="constant")
 
 
@@ -125,11 +129,8 @@ def _log_rejected_share(record: MapRecord, size_px: int) -> Float:
 
 
 def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
-    """Return (H,W) the log ratio of the greatest depth in the window to the least, 0 without one.
-
-    Depths are those of the filled pixels around (``filled_m``) and the pixel's own (``depth_m``),
-    which may be rejected.
-    """
+    """Return the (H,W) log ratio of greatest to least depth in the window, 0 without a depth."""
+    # These are the depths of filled pixels around, and the pixel's own, which may be rejected.
     own_m = np.where(depth_m > 0, depth_m, np.inf)
     least_m = np.minimum(np.where(filled_m > 0, filled_m, np.inf), own_m).astype(np.float32)
     nearest_m = ndimage.minimum_filter(least_m, size_px)
@@ -140,7 +141,7 @@ def _log_step(depth_m: Float32, filled_m: Float32, size_px: int) -> Float32:
 
 
 def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) -> Float32:
-    """Return (P,) confidences of pixels with `features` (P,10), by (10,) weights, or `WEIGHTS`."""
+    """Return the confidences (P,) of pixels with features (P,10), by `WEIGHTS` or others (10,)."""
     if weights is None:
         weights = np.array([*WEIGHTS.values()])
     log_p = -np.logaddexp(0, -(evidence @ weights)) / np.log(10)
@@ -148,17 +149,17 @@ def confidence_of(evidence: NDArray[np.floating], weights: Float | None = None) 
 
 
 def confidence_by_age(since_key_ns: Int) -> Float32:
-    """Return (M,) relative scores 1 / (1 + t) of 0 to 1 for points t seconds from the key."""
+    """Return the scores (M,) 1 / (1 + t), 0 to 1, of points measured t seconds from the key."""
     return (1 / (1 + np.abs(since_key_ns) * 1e-9)).astype(np.float32)
 
 
 def choose_most_certain(
     confidence: Float32, max_outliers: float, before: Float32 | None = None
 ) -> Bool:
-    """Return (P,) True at the most certain of pixels with confidences (P,).
+    """Return the mask (P,) of the most certain of pixels with confidences (P,).
 
-    As many are chosen as keep the expected share of outliers of the chosen pixels, and of those
-    with the confidences ``before`` that are chosen already, at most ``max_outliers``.
+    As many are chosen as keep the expected share of outliers at most ``max_outliers``. The share
+    includes pixels with the confidences ``before``, which are chosen already.
     """
     before_probability = outlier_probability(np.zeros(0) if before is None else before)
     best_first = np.argsort(-confidence, kind="stable")
@@ -173,11 +174,11 @@ def choose_most_certain(
 
 
 def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthMap:
-    """Return the map with as many pixels as possible at this expected share of outliers.
+    """Return the map with as many pixels as possible at an expected share of outliers.
 
     If the map expects fewer outliers, the most certain of its rejected pixels are given back. If it
-    expects more, its least certain pixels are left out. With None, or without calibrated
-    confidence, it keeps its pixels.
+    expects more, its least certain pixels are left out. The result has no rejected pixels.
+    Without calibrated confidence, or with ``max_outliers`` None, the map keeps its pixels.
     """
     rejected = depth_map.rejected
     if rejected is None or max_outliers is None:
@@ -209,16 +210,16 @@ def with_max_outliers(depth_map: DepthMap, max_outliers: float | None) -> DepthM
 def without_times(
     depth_map: DepthMap, smear_m: float, camera: Camera, share: float = 1.0
 ) -> DepthMap:
-    """Return the map with lower confidence at near pixels, if a ``share`` of sweeps has no times.
+    """Return the map with confidences lowered for sweeps without firing times.
 
-    The vehicle's motion within such a sweep moves depths by an unknown amount up to ``smear_m`` in
-    either direction: half the travel along the camera's axis from sweep to sweep. Near pixels
-    tolerate less of it than far pixels.
+    The vehicle's motion within such a sweep moves depths by an unknown amount. Near pixels tolerate
+    less of this motion than far pixels. The greatest change of depth, ``smear_m``, is half the
+    travel along the camera's axis from sweep to sweep. A ``share`` of the sweeps has no times.
     """
 
     def outlier_or_smeared(probability: Float, depth_m: Float32) -> Float:
         """Return the probability of an outlier by other causes or by the motion."""
-        # Any shift up to smear_m is as likely as another.
+        # All shifts up to smear_m are equally likely.
         tolerated_m = depth_m * tolerance(depth_m, camera)
         smeared = share * np.clip(1 - tolerated_m / max(smear_m, 1e-9), 0, 1)
         return 1 - (1 - probability) * (1 - smeared)
@@ -227,7 +228,7 @@ def without_times(
 
 
 def without_confirmation(depth_map: DepthMap) -> DepthMap:
-    """Return the map of one sweep alone, with the outliers that no other sweep could contradict."""
+    """Return the map of a single sweep with confidences lowered, as no other sweep confirms it."""
     return _with_probability(depth_map, lambda probability, _: _UNCONFIRMED * probability)
 
 
@@ -249,7 +250,7 @@ def _with_probability(depth_map: DepthMap, change: Callable[[Float, Float32], Fl
 
 
 def expected_outliers(depth_map: DepthMap) -> dict[str, float | None]:
-    """Return the expected outlier share of the ``measured`` and ``filled`` map, None if empty."""
+    """Return the expected outlier share of ``measured`` and ``filled`` pixels, None without any."""
     shares: dict[str, float | None] = {}
     for name, depth_m in (("measured", depth_map.depth_m), ("filled", depth_map.filled_m)):
         probability = outlier_probability(depth_map.confidence[depth_m > 0])
@@ -258,10 +259,11 @@ def expected_outliers(depth_map: DepthMap) -> dict[str, float | None]:
 
 
 def reliability(depth_map: DepthMap, truth_m: Float32, camera: Camera) -> list[dict[str, Any]]:
-    """Return expected and true outliers by confidence, over filled pixels with a depth ``truth_m``.
+    """Return the expected and the true share of outliers for each interval of confidence.
 
-    Each interval of 0.05 with pixels has ``confidence`` (its start), ``num_compared`` pixels, and
-    the ``expected`` and the true share of ``outliers``.
+    Filled pixels with a true depth ``truth_m`` (H,W), metres, are compared. Each interval of 0.05
+    with pixels has ``confidence`` (its start), ``num_compared`` pixels, and the ``expected`` and
+    the true share of ``outliers``.
     """
     compared = (truth_m > 0) & (depth_map.filled_m > 0)
     confidence = depth_map.confidence[compared]

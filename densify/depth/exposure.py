@@ -56,12 +56,13 @@ def key_shots(
     key: int,
     settings: ProjectSettings = _USUAL,
 ) -> dict[str, Shot]:
-    """Return the `Shot` of each depth map of a key sweep, by the name of the map.
+    """Return the camera, image and time of each depth map of a key sweep, by name of the map.
 
-    By default each camera has one map, with its name. It shows the image exposed nearest to the key
-    sweep, the earlier of two. With ``project.per=image`` there is a map CAMERA/NUMBER for each
-    image nearer to the key sweep than to any other. Without an image within about half a period the
-    default map shows the time of the sweep. ``key`` is the frame number of the key sweep.
+    By default each camera has one map, with the camera's name. The map shows the image exposed
+    nearest to the key sweep, the earlier of two. With ``project.per=image`` each image that is
+    nearer to the key sweep than to other sweeps has a map CAMERA/NUMBER. Without an image within
+    about half a period the default map shows the time of the sweep. ``key`` is the frame number of
+    the key sweep.
     """
     stamp_ns = sequence.stamp_ns(key)
     begin_ns, end_ns = _own_time_ns(sequence, key)
@@ -84,35 +85,33 @@ def key_shots(
                     (end_ns - begin_ns) / 2e6,  # half of the interval, in ms
                 )
         elif images_ns:
-            _, exposed_ns, nearest = min(
+            _, exposed_ns, nearest_number = min(
                 (abs(exposed_ns - stamp_ns), exposed_ns, number)
                 for number, exposed_ns in images_ns.items()
             )
             shown_ns = exposed_ns if settings.at == "camera" else stamp_ns
-            shots[camera.name] = Shot(camera, nearest, shown_ns)
+            shots[camera.name] = Shot(camera, nearest_number, shown_ns)
         else:
             shots[camera.name] = Shot(camera, None, stamp_ns)
     return shots
 
 
 def load_images(sequence: LidarSequence, shots: Mapping[str, Shot]) -> dict[str, NDArray[np.uint8]]:
-    """Return the (H,W,3) RGB images of the shots that show an image, by the name of the map."""
-    images = {
+    """Return the RGB images (H,W,3) of the shots that show an image, by name of the map."""
+    camera_and_number = {
         name: (shot.camera.name, shot.number)
         for name, shot in shots.items()
         if shot.number is not None
     }
     if hasattr(sequence, "prepare"):
-        sequence.prepare((), list(images.values()))
-    return {name: sequence.image(*image) for name, image in images.items()}
+        sequence.prepare((), list(camera_and_number.values()))
+    return {name: sequence.image(*image) for name, image in camera_and_number.items()}
 
 
 def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
-    """Return start and end (ns) of the time nearer to the key sweep than to any other sweep.
-
-    Towards a gap or an end of the recording it is at most 1.5 times as long as on the other side.
-    It is not limited if neither neighbour has a stamp.
-    """
+    """Return start and end (ns) of the time nearer to the key sweep than to any other sweep."""
+    # Towards a gap or an end of the recording the time is at most 1.5 times as long as on the other
+    # side. The time has no limits if neither neighbour has a stamp.
     frames = list(sequence.frames)
     index = frames.index(key)
     key_ns = sequence.stamp_ns(key)
@@ -122,7 +121,6 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
             stamps_ns.append(sequence.stamp_ns(frame))
     if len(stamps_ns) < 2:
         return np.iinfo(np.int64).min, np.iinfo(np.int64).max
-    # A gap in the recording, or the end of it, must not widen the time.
     max_period_ns = int(_JITTER * np.diff(sorted(stamps_ns)).min())
     before_ns = max([key_ns - max_period_ns, *(t_ns for t_ns in stamps_ns if t_ns < key_ns)])
     after_ns = min([key_ns + max_period_ns, *(t_ns for t_ns in stamps_ns if t_ns > key_ns)])
@@ -130,7 +128,7 @@ def _own_time_ns(sequence: LidarSequence, key: int) -> tuple[int, int]:
 
 
 def pixel_of(uv: Float) -> tuple[Int, Int]:
-    """Return the (K,) rows and the (K,) columns of the pixels at image coordinates (K,2)."""
+    """Return the rows (K,) and the columns (K,) of the pixels at image coordinates uv (K,2)."""
     column, row = np.rint(uv).astype(np.int64).T
     return row, column
 
@@ -144,7 +142,7 @@ class InView(NamedTuple):
     uv: Float  # (K,2) pixel coordinates as in `Sight`
 
     def joined(self, appended: InView, num_points: int) -> InView:
-        """Return the points in view of two clouds joined to one; the first has ``num_points``."""
+        """Return the points in view of this cloud of ``num_points`` with another one appended."""
         return InView(
             self.exposure,
             np.concatenate([self.rows, num_points + appended.rows]),
@@ -182,8 +180,9 @@ class Exposure:
     ) -> Exposure:
         """Return the camera of a depth map at the map's time, relative to the key sweep.
 
-        The camera pose is the recorded pose of the image. Without one it is extrapolated from the
-        key sweep with the vehicle's twist. ``output.optical_flow`` adds the ``neighbours``.
+        The camera's pose is the recorded pose of the image. Without a recorded pose it is
+        extrapolated from the key sweep with the vehicle's twist. ``output.optical_flow`` adds the
+        exposures of the neighbouring images. ``key`` is the frame number of the key sweep.
         """
         exposure = _exposure(sequence, stretch, key, key, shot, settings)
         if not settings.output.optical_flow or shot.number is None:
@@ -198,7 +197,7 @@ class Exposure:
             number, exposed_ns = images[neighbour_index]
             frame = stretch.frames[int(np.argmin(np.abs(sweeps_ns - exposed_ns)))]
             begin_ns, end_ns = _own_time_ns(sequence, frame)
-            # An image nearer to a sweep outside the window is too far for the pose of one inside.
+            # Sweeps of the window are too far for the pose of an image nearer to a sweep outside.
             if begin_ns < exposed_ns <= end_ns:
                 at_sweep = settings.project.at == "sweep"
                 shown_ns = stretch[frame].sweep.stamp_ns if at_sweep else exposed_ns
@@ -207,7 +206,7 @@ class Exposure:
         return replace(exposure, neighbours=neighbours)
 
     def see(self, points: Float, velocity_m_s: Float | Float32) -> Sight:
-        """Project points to the image.
+        """Return N points projected to the image, in the order given.
 
         Moving points advance by their velocity to the exposure. With a rolling shutter each row or
         column has its own exposure time. Points beside or behind a wide lens have no z and are not
@@ -215,7 +214,7 @@ class Exposure:
 
         Args:
             points: (N,3) positions in metres, key sweep's lidar frame, at its reference time.
-            velocity_m_s: Velocities without ego-motion, same frame; (N,3), or (3,) for all points.
+            velocity_m_s: (N,3) velocities without ego-motion, same frame, or (3,) for all points.
         """
         at_shown_time = points + self.late_s * velocity_m_s if velocity_m_s.any() else points
         points_cam = poses.transform(self.T_cam_key, at_shown_time)
@@ -224,7 +223,7 @@ class Exposure:
             return Sight(points_cam, uv, inside & (self.depth_m(points_cam) > NEAREST_M))
 
         # The row that observes a point depends on its position at that row's exposure time, which
-        # depends on the row. Both are found by iteration.
+        # depends on the row. Both are found by iteration, from the row without a rolling shutter.
         exposed_cam = points_cam
         last_pixel = np.array([self.camera.width_px - 1, self.camera.height_px - 1])
         pixel_time_s = np.array([self.camera.column_time_s, self.camera.row_time_s])
@@ -241,26 +240,26 @@ class Exposure:
         return Sight(exposed_cam, uv, inside & (self.depth_m(exposed_cam) > NEAREST_M))
 
     def view_of(self, cloud: Cloud) -> InView:
-        """Return the points in the image of a cloud at the key sweep's reference time."""
+        """Return the points of a cloud (at the key sweep's reference time) in the image."""
         rows, points_cam, uv = [], [], []
-        for first in range(0, max(1, len(cloud)), AT_ONCE):
-            chunk = slice(first, first + AT_ONCE)
+        for begin in range(0, max(1, len(cloud)), AT_ONCE):
+            chunk = slice(begin, begin + AT_ONCE)
             sight = self.see(cloud.points[chunk], cloud.velocity_m_s[chunk])
             inside = np.flatnonzero(sight.inside)
-            rows.append(first + inside)
+            rows.append(begin + inside)
             points_cam.append(sight.points_cam.take(inside, axis=0))
             uv.append(sight.uv.take(inside, axis=0))
         return InView(self, np.concatenate(rows), np.concatenate(points_cam), np.concatenate(uv))
 
     def depth_m(self, points_cam: Float) -> Float:
-        """Return the (N,) depth of points (N,3), camera frame: z or range, by ``measure``."""
+        """Return the depths (N,) in metres of points (N,3), camera frame: z or range."""
         return depth_along(points_cam, self.measure)
 
 
 def _exposure(
     sequence: LidarSequence, stretch: Stretch, key: int, frame: int, shot: Shot, settings: Config
 ) -> Exposure:
-    """Return the exposure of a shot (as `Exposure.of`), extrapolated from sweep ``frame``."""
+    """Return the exposure of a shot without neighbours, extrapolated from sweep ``frame``."""
     camera = shot.camera
     registered = stretch[frame]
     since_sweep_s = float(shot.stamp_ns - registered.sweep.stamp_ns) * 1e-9
@@ -294,14 +293,14 @@ class PointsInImage(NamedTuple):
     slope: Float
     spacing_px: Float  # (K,2) spacing of neighbouring rays, across and down
     frame: np.ndarray  # (K,) frame number of the source sweep
-    age_ns: Int  # (K,) time between the source sweep and the key sweep, see `_ages_ns`
+    age_ns: Int  # (K,) time between source and key sweep, equal if it differs by less than 10 ms
     far: Bool  # (K,) True for points of sweeps beyond the window
 
 
 def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInImage:
     """Return the points of a cloud in an image, with size and slope of their patches in pixels.
 
-    They are ordered by the rows of the image. Where a patch is seen edge-on its slope is 0.
+    The points are ordered by the rows of the image. A patch that is seen edge-on has the slope 0.
     """
     # In the order of the image's rows, points that are used together lie together in memory.
     order = np.argsort(np.rint(view.uv[:, 1]).astype(np.uint16), kind="stable")
@@ -333,9 +332,10 @@ def points_in_image(cloud: Cloud, view: InView, patches: Patches) -> PointsInIma
 def _pinhole_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> tuple[Float, Float, Float]:
-    """Return ``focal_px``, ``slope`` and ``spacing_px`` of `PointsInImage`: a rectified image, z.
+    """Return ``focal_px``, ``slope`` and ``spacing_px`` of `PointsInImage`, (K,2) each.
 
-    Normals (K,3) are in the camera frame. The slope is not finite where a patch is seen edge-on.
+    Images are rectified, depths are z. Points and normals (K,3) are in the camera frame, spacings
+    (K,2) along azimuth and elevation. The slope is not finite where a patch is seen edge-on.
     """
     focal_px = exposure.camera.K[[0, 1], [0, 1]]
     # On the plane n · p = d the inverse depth is n · ray / d: linear over the image.
@@ -350,26 +350,34 @@ def _pinhole_scale(
 def _lens_scale(
     exposure: Exposure, points_cam: Float, depth: Float32, normal: Float, spacing_m: Float32
 ) -> tuple[Float, Float, Float]:
-    """Return the values of `_pinhole_scale` for any lens and measure."""
+    """Return the values of `_pinhole_scale` for any lens and measure of depth."""
     # J (K,2,3): px that a point moves right and down in the image, per metre that it moves in space
     J = pixels_per_metre(exposure.camera, points_cam)
     focal_px = np.linalg.norm(J, axis=2) * depth[:, None]
+    slope = _lens_slope(exposure.measure, points_cam, normal, J)
+    return focal_px, slope, _ray_spacing_px(exposure, points_cam, spacing_m, J)
 
-    # Slope: a point p moves on its plane n · p = d until it has moved by one pixel, by
-    # δ = J⁺ - p (n · J⁺) / d. The pseudoinverse J⁺ moves it across its ray by one pixel, the second
-    # term along the ray back to the plane. The inverse depth changes by -δ_z / z², and the inverse
-    # range by -p · δ / r³, where p · J⁺ is 0.
+
+def _lens_slope(measure: str, points_cam: Float, normal: Float, J: Float) -> Float:
+    """Return the (K,2) slope of inverse depth (1/m per px) of planes through points (K,3)."""
+    # A point p moves on its plane n · p = d until it has moved by one pixel, by
+    # δ = J⁺ - p (n · J⁺) / d. The pseudoinverse J⁺ (K,3,2) moves the point across its ray by one
+    # pixel, the second term moves it along the ray back to the plane. The inverse depth changes by
+    # -δ_z / z², and the inverse range by -p · δ / r³, where p · J⁺ is 0.
     distance = np.einsum("ij,ij->i", normal, points_cam)  # d
     with np.errstate(divide="ignore", invalid="ignore"):
         metres_per_px = J.transpose(0, 2, 1) @ np.linalg.inv(J @ J.transpose(0, 2, 1))  # J⁺
+        # (K,2) relative change of the range per pixel, -(n · J⁺) / d
         range_share = -np.einsum("ij,ijk->ik", normal, metres_per_px) / distance[:, None]
-        if exposure.measure == "z":
+        if measure == "z":
             z = points_cam[:, 2:]
-            slope = -(metres_per_px[:, 2] + range_share * z) / z**2
-        else:
-            slope = -range_share / np.linalg.norm(points_cam, axis=1, keepdims=True)
+            return -(metres_per_px[:, 2] + range_share * z) / z**2
+        return -range_share / np.linalg.norm(points_cam, axis=1, keepdims=True)
 
-    # Spacing: rays of a scanner are spaced in azimuth and elevation, about the key's upward axis.
+
+def _ray_spacing_px(exposure: Exposure, points_cam: Float, spacing_m: Float32, J: Float) -> Float:
+    """Return the (K,2) spacing of rays right and down in px, from (K,2) metres."""
+    # Rays of a scanner are spaced in azimuth and elevation, about the key's upward axis.
     azimuth_axis = np.cross(exposure.T_cam_key[:3, 2], points_cam)
     azimuth_axis /= np.maximum(np.linalg.norm(azimuth_axis, axis=1, keepdims=True), 1e-9)
     elevation_axis = np.cross(points_cam, azimuth_axis)
@@ -378,15 +386,13 @@ def _lens_scale(
         np.einsum("ijk,ik->ij", J, axis) * spacing_m[:, [column]]
         for column, axis in enumerate((azimuth_axis, elevation_axis))
     )
-    return focal_px, slope, np.hypot(azimuth_px, elevation_px)
+    return np.hypot(azimuth_px, elevation_px)
 
 
 def _ages_ns(since_key_ns: Int, frame: np.ndarray, far: Bool) -> Int:
-    """Return (K,) ns between the points' sweeps and the key sweep.
-
-    Ages of two sweeps of the window that differ by less than 10 ms are made equal. Else clock
-    jitter would decide between a sweep before the key sweep and one after it.
-    """
+    """Return the times (K,) in ns between the points' sweeps and the key sweep."""
+    # Ages of two sweeps of the window that differ by less than 10 ms are made equal. Otherwise
+    # clock jitter would decide between a sweep before the key sweep and one after.
     ages_ns = np.abs(since_key_ns)
     in_window = np.flatnonzero(~far)
     if not len(in_window):

@@ -36,7 +36,7 @@ _MOST_RANGE_M = 60.0  # greatest range of returns that are registered well
 # Larger patches hide edges. These are large enough, because many sweeps measure each surface.
 _MOST_SPACING_M = 0.5 * AGREE_M
 _SLACK_M = 0.5  # distance from its pose at which a camera may be, in the fast test of the view
-_PRIME = 2_654_435_761  # its multiples visit any smaller number of points in mixed order
+_PRIME = 2_654_435_761  # multiples of it, modulo a number of points, shuffle the points
 _MIN_FILLED = 3  # least number of filled cells of nine, for a sweep beyond the window
 _TESTER_STEP_M = 5.0  # travel between testing sweeps
 # Travel from a sweep to the testing sweep of its points, and the least at the ends of the road. A
@@ -45,19 +45,19 @@ _TEST_M, _LEAST_TEST_M = 3.5, 2.0
 
 
 def in_reach(sweep: Sweep) -> Bool:
-    """Return (N,) True for returns within 60 m of the lidar, which are registered well."""
+    """Return the mask (N,) of the returns within 60 m of the lidar, which are registered well."""
     x, y, z = sweep.points.T
     return x * x + y * y + z * z < _MOST_RANGE_M**2
 
 
 def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> list[Bool]:
-    """Return for each sweep (N,) True where another sweep along the road saw through the point.
+    """Return, for each sweep, the mask (N,) of its points that another sweep saw through.
 
     Some sweeps, 5 m of travel apart, test the points of the others. Points ahead of a sweep are
-    tested by the next testing sweep at least 3.5 m farther, points behind it by the previous one.
-    By then even a vehicle that drives along has left most of its place. At the ends of the road the
+    tested by the next testing sweep at least 3.5 m farther, points behind by the previous one. By
+    then even a vehicle that drives along has left most of its place. At the ends of the road the
     last testing sweep is taken, if 2 m away or more, or the testing sweep on the other side. The S
-    deskewed sweeps have the ascending positions ``travel_m`` (S,) along the road.
+    deskewed sweeps have the ascending positions ``travel_m`` (S,) along the road in metres.
     """
     testers = _choose_testers(travel_m)
     with ThreadPoolExecutor(num_threads()) as pool:
@@ -65,7 +65,7 @@ def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> lis
         images = dict(zip(testers, range_images, strict=True))
 
     def find_in_sweep(index: int) -> Bool:
-        """Return (N,) True for the points of a sweep that were seen through."""
+        """Return the mask (N,) of the points of a sweep that were seen through."""
         tested = sweeps[index]
         points = tested.sweep.points
         own_testers = _choose_testers_of(index, testers, travel_m)
@@ -73,17 +73,19 @@ def find_seen_through(sweeps: Sequence[RegisteredSweep], travel_m: Float) -> lis
             poses.inverse(sweeps[tester].T_world_lidar) @ tested.T_world_lidar
             for tester in own_testers
         ]
-        # Points on the side of the later tester belong to it, the others to the first.
+        # With two testers, the later one tests the points on its own side, the earlier the others.
         tester_of_point = np.zeros(len(points), np.int64)
         if len(own_testers) == 2:
             to_later_tester = poses.inverse(T_tester_lidar[1])[:3, 3]
             tester_of_point[points @ to_later_tester > 0] = 1
 
         is_free = np.zeros(len(points), bool)
-        for number, tester in enumerate(own_testers):
-            rows = np.flatnonzero(tester_of_point == number)
-            points_tester = poses.transform(T_tester_lidar[number], points.take(rows, axis=0))
-            is_free[rows] = images[tester].sees_through(points_tester, *FREE_MARGIN, _MIN_FILLED)
+        for tester_number, tester in enumerate(own_testers):
+            rows = np.flatnonzero(tester_of_point == tester_number)
+            T = T_tester_lidar[tester_number]
+            is_free[rows] = images[tester].sees_through(
+                poses.transform(T, points.take(rows, axis=0)), *FREE_MARGIN, min_filled=_MIN_FILLED
+            )
         return is_free
 
     with ThreadPoolExecutor(num_threads()) as pool:
@@ -101,7 +103,7 @@ def _choose_testers(travel_m: Float) -> list[int]:
 
 
 def _choose_testers_of(index: int, testers: Sequence[int], travel_m: Float) -> list[int]:
-    """Return the testing sweeps (indices) of one sweep, on either side: two, one or none."""
+    """Return the indices of the sweeps that test one sweep, behind and ahead: two, one or none."""
     ahead_m = np.array([travel_m[tester] - travel_m[index] for tester in testers])
     chosen = []
     for distance_m in (-ahead_m, ahead_m):
@@ -114,7 +116,7 @@ def _choose_testers_of(index: int, testers: Sequence[int], travel_m: Float) -> l
 
 
 def static_points(sensors: Sensors, registered: RegisteredSweep, seen_through: Bool) -> StaticWorld:
-    """Return the points of a sweep not ``seen_through`` (N,), world frame, with their patches."""
+    """Return a sweep's points, except ``seen_through`` (N,), in the world, with their patches."""
     sweep, T_world_lidar = registered.sweep, registered.T_world_lidar
     source = np.zeros(len(sweep), np.int32)
     surface = fit_tangents(sweep.points, sweep.lidar, source, sensors, [sensors.origins_m])
@@ -133,11 +135,11 @@ def static_points(sensors: Sensors, registered: RegisteredSweep, seen_through: B
 
 def join_worlds(worlds: Sequence[StaticWorld]) -> StaticWorld:
     """Return the parts of one static world as a whole, ordered by frame number."""
-    # The empty world is there so that something can be concatenated.
+    # Without parts, the columns of the empty world are concatenated.
     parts = [_EMPTY_WORLD, *sorted(worlds, key=lambda world: world.frames)]
-    # ``source`` is an index in ``frames``: those of a part follow those of the parts before it.
-    firsts = np.cumsum([0, *(len(part.frames) for part in parts)])
-    sources = [part.source + np.int32(first) for part, first in zip(parts, firsts, strict=False)]
+    # ``source`` is an index in ``frames``. The frames of a part follow those of all earlier parts.
+    starts = np.cumsum([0, *(len(part.frames) for part in parts)])
+    sources = [part.source + np.int32(start) for part, start in zip(parts, starts, strict=False)]
     names = {field.name for field in fields(StaticWorld)} - {"source", "frames", "left_out"}
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in names
@@ -160,9 +162,10 @@ _EMPTY_WORLD = StaticWorld(
 
 
 def may_see(camera: Camera, T_cam_world: Float, points: Float32, slack_m: float) -> Bool:
-    """Return (N,) True for points (N,3) that a camera up to ``slack_m`` from its pose may observe.
+    """Return the mask (N,) of the points that a camera near a given pose may observe.
 
     This is a fast test: False is certain, unlike True. For a lens that is no pinhole all are True.
+    Points (N,3) are in the world frame. The camera is at most ``slack_m`` from the pose.
     """
     if camera.model != "pinhole":
         return np.ones(len(points), bool)
@@ -190,7 +193,8 @@ def far_cloud(
 ) -> tuple[Cloud, Patches]:
     """Return the points beyond the window that a camera observes, and their patches.
 
-    Both are in the key sweep's lidar frame. One point per pixel and step of depth is kept. With
+    Points and patches are in the key sweep's lidar frame. One point per pixel and step of depth is
+    kept. Exposures are by name of the map, ``key`` is the frame number of the key sweep. With
     ``static_only``, points that the first or the last sweep of the window saw through are left out.
     """
     is_beyond = ~np.isin(world.frames, stretch.frames)
@@ -225,32 +229,37 @@ def far_cloud(
 
 
 def _select_needed(points: Float32, rows: Int, T_key_world: Float, exposure: Exposure) -> Int:
-    """Return those of the ``rows`` (K,) of points (N,3), world frame, that a camera needs.
+    """Return the ``rows`` (K,) of points (N,3), world, with one in each pixel and depth step."""
+    if not len(rows):
+        return rows
+    chunks = [
+        _find_cells(points, rows[begin : begin + AT_ONCE], T_key_world, exposure)
+        for begin in range(0, len(rows), AT_ONCE)
+    ]
+    rows_in_view, cell_of_row = (np.concatenate(column) for column in zip(*chunks, strict=True))
+    # Shuffle, because support needs several sweeps among neighbouring pixels.
+    shuffled_order = np.arange(len(rows_in_view)) * _PRIME % max(1, len(rows_in_view))
+    return rows_in_view[thinned(cell_of_row, shuffled_order, step=1.0, max_per_cell=1)]
 
-    It needs one point in every pixel and step of depth.
-    """
+
+def _find_cells(
+    points: Float32, rows: Int, T_key_world: Float, exposure: Exposure
+) -> tuple[Int, Float32]:
+    """Return the rows in the image, and their (K,3) cells: column, row, step of log depth."""
+    # A fast test first: the projection takes far longer.
     T_cam_world = exposure.T_cam_key @ T_key_world
-    rows_in_view, cells = [rows[:0]], [np.zeros((0, 3), np.float32)]
-    for first in range(0, len(rows), AT_ONCE):
-        # A fast test first: the projection takes far longer.
-        chunk = rows[first : first + AT_ONCE]
-        may_be_seen = may_see(exposure.camera, T_cam_world, points.take(chunk, axis=0), _SLACK_M)
-        viewable = chunk[may_be_seen]
-        points_key = poses.transform(T_key_world, points.take(viewable, axis=0).astype(np.float64))
-        sight = exposure.see(points_key, np.zeros(points_key.shape, np.float32))
-        inside = np.flatnonzero(sight.inside)
-        depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
-        cell = np.column_stack([sight.uv.take(inside, axis=0), np.log(depth_m) / HIDDEN_FRACTION])
-        rows_in_view.append(viewable[inside])
-        cells.append(np.rint(cell.astype(np.float32)))
-    all_rows = np.concatenate(rows_in_view)
-    # A pixel is supported only by several sweeps, so neighbouring pixels take different sweeps.
-    mixed_order = np.arange(len(all_rows)) * _PRIME % max(1, len(all_rows))
-    return all_rows[thinned(np.concatenate(cells), mixed_order, 1.0, 1)]
+    viewable = rows[may_see(exposure.camera, T_cam_world, points.take(rows, axis=0), _SLACK_M)]
+    points_key = poses.transform(T_key_world, points.take(viewable, axis=0).astype(np.float64))
+    sight = exposure.see(points_key, np.zeros(points_key.shape, np.float32))
+    inside = np.flatnonzero(sight.inside)
+    depth_m = exposure.depth_m(sight.points_cam.take(inside, axis=0))
+    depth_step = np.log(depth_m) / HIDDEN_FRACTION
+    cell = np.column_stack([sight.uv.take(inside, axis=0), depth_step])
+    return viewable[inside], np.rint(cell.astype(np.float32))
 
 
 def _seen_through_by_ends(points: Float, stretch: Stretch, key: int) -> Bool:
-    """Return (M,) True for points, key frame, that the window's first or last sweep saw through."""
+    """Return the mask (M,) of the points that the window's first or last sweep saw through."""
     is_free = np.zeros(len(points), bool)
     for frame in {stretch.frames[0], stretch.frames[-1]} - {key}:
         points_sweep = poses.transform(stretch.T_target_source(frame, key), points)

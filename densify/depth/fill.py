@@ -71,7 +71,7 @@ _SPOT_PX = 4  # greatest radius of a laser's spot
 
 
 def to_lab(image: NDArray[np.uint8]) -> Float32:
-    """Convert (H,W,3) RGB to CIE L*a*b*, L from 0 to 100; slightly blurred, lightened if dark."""
+    """Return an RGB image (H,W,3) in CIE L*a*b*, slightly blurred, and lightened if dark."""
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255, (0, 0), _BLUR_PX)
     colours = cv2.cvtColor(blurred, cv2.COLOR_RGB2LAB).astype(np.float32, copy=False)
     lightest = float(np.percentile(colours[..., 0], 99))
@@ -80,9 +80,9 @@ def to_lab(image: NDArray[np.uint8]) -> Float32:
 
 @Kernel
 def _march(steps):  # type: ignore[no-untyped-def]
-    """Fill in steps (16,H+4,W+4), 0 at known pixels; the border of two pixels stays unchanged."""
-    # The steps of a pixel follow from those of the pixels one and two steps on. The rows go against
-    # the direction, so that these are computed before.
+    """Fill in ``steps`` (16,H+4,W+4) to the next known pixel; known pixels and border are given."""
+    # The steps of a pixel follow from the steps of the pixels one and two steps on. Rows are
+    # visited against the direction, so that those two pixels come first.
     height, width = steps.shape[1:]
     for d in range(len(DIRECTIONS)):
         u1, v1, u2, v2 = DIRECTIONS[d].ravel()  # columns and rows after one step, after two steps
@@ -96,8 +96,8 @@ def _march(steps):  # type: ignore[no-untyped-def]
                     next_steps = steps[d, row, 2 + column + u1]
                     line[column] = 0 if line[column] == 0 else min(next_steps, 254) + 1
                 continue
-            # 0 steps if known, 1 if the pixel one step on is, else two more than the pixel two on.
-            # A sum above 255 (_NONE) would overflow.
+            # A known pixel has 0 steps. A pixel has 1 step if the pixel one step on is known, else
+            # two more than the pixel two steps on. A sum above 255 (_NONE) would overflow.
             after_one = steps[d, row + v1, 2 + u1 : width - 2 + u1]
             after_two = steps[d, row + v2, 2 + u2 : width - 2 + u2]
             for j in range(len(line)):
@@ -108,7 +108,7 @@ def _march(steps):  # type: ignore[no-untyped-def]
 
 @inlined
 def offset(d, k):  # type: ignore[no-untyped-def]
-    """Return the offset in columns and rows after k steps in direction d of `DIRECTIONS`."""
+    """Return the offset in columns and in rows after k steps in direction d of `DIRECTIONS`."""
     du = (k // 2) * DIRECTIONS[d, 1, 0] + (k % 2) * DIRECTIONS[d, 0, 0]
     dv = (k // 2) * DIRECTIONS[d, 1, 1] + (k % 2) * DIRECTIONS[d, 0, 1]
     return du, dv
@@ -116,7 +116,7 @@ def offset(d, k):  # type: ignore[no-untyped-def]
 
 @inlined
 def extend(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
-    """Return the inverse depth (1/m) at pixel (v - dv, u - du) of the surface of pixel (v, u).
+    """Return the inverse depth (1/m) of the surface of pixel (v, u), extended to (v - dv, u - du).
 
     ``inverse`` (H,W) holds inverse depths in 1/m, ``tilt`` (H,W,2) their slopes to the right and
     down in 1/m per px. v and dv count rows, u and du columns.
@@ -129,14 +129,14 @@ def extend(inverse, tilt, v, u, du, dv):  # type: ignore[no-untyped-def]
 class Voters(NamedTuple):
     """Pixels with a known depth, which vote on the depths of pixels around them."""
 
-    # (16,H,W) steps to the first such pixel in `DIRECTIONS`, 0 at it, or `_NONE`
+    # (16,H,W) steps to the first voter in each of `DIRECTIONS`, 0 at a voter, `_NONE` without one
     steps: NDArray[np.uint8]
     inverse: Float32  # (H,W) inverse depth in 1/m, 0 where the depth is unknown
     tilt: Float32  # (H,W,2) slope of the inverse depth to the right and down, 1/m per px
 
     @staticmethod
     def of(depth_m: Float32, tilt: Float32) -> Voters:
-        """Return the pixels of a map (H,W) with a depth above 0."""
+        """Return the pixels with a depth above 0 of a map (H,W) in metres as voters."""
         known = depth_m > 0
         height, width = known.shape
         # Two steps reach at most two pixels beyond the image, hence a border of two on each side.
@@ -154,19 +154,20 @@ def votes_for(
     """Return the (P,) weighted share of the votes, 0 to 1, that confirm the depth of each pixel.
 
     The first known pixel in each of 16 directions votes, up to 6 ray spacings away. It votes for
-    the depth if its own surface, extended to the pixel, has that depth to 0.2 m and 6 %, otherwise
+    the depth if its own surface, extended to the pixel, has this depth to 0.2 m and 6 %, otherwise
     against. Edges of the record's image, and distance, weaken votes.
 
     Args:
-        maps_m: Depths (H,W) of the pixels that vote, 0 for other pixels. The least share of the
-            maps counts.
-        pixel: (P,) flat indices of the pixels, whose depths ``depth_m`` (P,) are to be confirmed.
+        maps_m: Depths (H,W) in metres of the pixels that vote, 0 for other pixels. The least share
+            of the maps counts.
+        pixel: (P,) flat indices of the pixels.
+        depth_m: (P,) depths of the pixels in metres, which are to be confirmed.
         with_shifts: Take the least share of five positions of the image, unshifted and shifted by
             0.6 ray spacings to each side, with a small constant vote. Otherwise the image is
-            unshifted, and the share is 0 without voters.
+            unshifted, and a pixel without voters has the share 0.
     """
     shares = np.ones((len(maps_m), len(pixel)), np.float32)
-    # The kernel is compiled for each memory layout of its arrays: here they have one.
+    # The kernel is compiled for each memory layout of its arrays: one layout saves time.
     tilt, inverse = np.ascontiguousarray(record.tilt), 1 / depth_m
     colours, gap_px = np.ascontiguousarray(record.lab), record.gap_px
     for map_m, share in zip(maps_m, shares, strict=True):
@@ -180,7 +181,7 @@ def _steps_to_other(steps, d, v, u):  # type: ignore[no-untyped-def]
     """Return the steps in direction d from row v, column u to another known pixel, or `_NONE`."""
     num_steps = np.int64(steps[d, v, u])
     height, width = steps.shape[1:]
-    # A known pixel is 0 steps from itself, and the pixels one and two steps on decide. For other
+    # A known pixel is 0 steps from itself, so the pixels one and two steps on decide. For unknown
     # pixels the loop is empty.
     for k in range(1, 3 if num_steps == 0 else 1):
         du, dv = offset(d, k)
@@ -194,7 +195,7 @@ def _steps_to_other(steps, d, v, u):  # type: ignore[no-untyped-def]
 
 @inlined
 def _cast_votes(voters, v, u, depth_m, gap_px, steps, agrees):  # type: ignore[no-untyped-def]
-    """Fill in ``steps`` (16,) to the voters (0: none) and ``agrees`` (16,); count both votes."""
+    """Fill ``steps`` (16,) to the voters, 0 without one, and ``agrees`` (16,), and count votes."""
     tolerance_m = HIDDEN_M + HIDDEN_FRACTION * depth_m
     num_for, num_against = 0, 0
     for d in range(len(steps)):
@@ -234,12 +235,12 @@ def _colour_weight(lab, v, u, d, k, gap_px):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def _vote(first, last, pixel, inverse, voters, lab, gap_px, with_shifts, share):  # type: ignore[no-untyped-def]
+def _vote(begin, end, pixel, inverse, voters, lab, gap_px, with_shifts, share):  # type: ignore[no-untyped-def]
     """Fill ``share`` (P,) with the share of the votes for inverse depths ``inverse`` (P,), 1/m."""
     width, num_directions = gap_px.shape[1], len(DIRECTIONS)
     steps, agrees = np.empty(num_directions, np.int64), np.empty(num_directions, np.bool_)
     doubt = _DOUBT if with_shifts else 0.0
-    for i in range(first, last):
+    for i in range(begin, end):
         v, u = pixel[i] // width, pixel[i] % width
         gap = gap_px[v, u]
         num_for, num_against = _cast_votes(voters, v, u, 1 / inverse[i], gap, steps, agrees)
@@ -265,10 +266,10 @@ def _vote(first, last, pixel, inverse, voters, lab, gap_px, with_shifts, share):
 
 
 def accept_boundary_pixels(record: MapRecord, rims: str) -> None:
-    """Accept boundary pixels of the record, in place, by ``project.rims``; others are rejected.
+    """Accept or reject each boundary pixel of the record, in place.
 
-    ``image`` accepts those with 97 % of the votes (none without an image), ``keep`` all, and any
-    other value none.
+    By ``rims``, the setting ``project.rims``, ``image`` accepts pixels with 97 % of the votes, or
+    no pixel without an image. ``keep`` accepts all pixels, and any other value none.
     """
     pixel = np.flatnonzero(record.boundary_m)
     depth_m = record.boundary_m.flat[pixel]
@@ -287,9 +288,9 @@ def _reject_unconfirmed(record: MapRecord, empty: Bool, least_share: float) -> N
     """Reject filled pixels that were ``empty`` (H,W) and have less than this share of votes."""
     is_new = empty & (record.filled_m > 0)
     pixel = np.flatnonzero(is_new)
-    # Filled pixels have no vote, because they would confirm themselves. The share is the lesser one
-    # with and without the boundary pixels that were not accepted, which can only lower it. This
-    # protects the pillar of a car, which has few measured pixels.
+    # Filled pixels have no vote, because they would confirm themselves. Boundary pixels that were
+    # not accepted vote in one of two maps. The lesser share counts, so they can only lower a share.
+    # This protects the pillar of a car, which has few measured pixels.
     maps_m = np.maximum(record.depth_m, record.boundary_m), record.depth_m
     share = votes_for(record, maps_m, pixel, record.filled_m.flat[pixel], with_shifts=False)
     record.votes.flat[pixel] = share
@@ -301,10 +302,10 @@ def _reject_unconfirmed(record: MapRecord, empty: Bool, least_share: float) -> N
 class _Known(NamedTuple):
     """The K known pixels of a map, row by row."""
 
-    # (H,W+1) number of known pixels above row r, or left of column c in row r. It is the index of
-    # the first known pixel from there on: [r, left] to [r, right] are those of a part of row r.
+    # (H,W+1) index of the first known pixel from row r, column c on: the number of known pixels
+    # above row r, and left of column c in row r
     before: NDArray[np.int32]
-    num: NDArray[np.int32]  # (H+1,W+1) integral image: number of known pixels above and left
+    integral: NDArray[np.int32]  # (H+1,W+1) number of known pixels above row r, left of column c
     column: NDArray[np.int32]  # (K,) column of each pixel
     inverse: Float  # (K,) float64 inverse depth of each pixel, 1/m
 
@@ -313,9 +314,9 @@ def fill(record: MapRecord, reach: float) -> None:
     """Interpolate empty pixels of the record that have measured pixels on both sides, in place.
 
     The window around an empty pixel must hold measured pixels to its left, to its right, above and
-    below: nothing is extrapolated. No depth discontinuity may run through them. There is a
-    discontinuity if deviations from a plane differ by more than 0.2 m and 6 % of the nearest depth.
-    With fewer than six pixels the depths themselves are compared.
+    below: nothing is extrapolated. No depth discontinuity may run through the window. Pixels on
+    both sides of a discontinuity deviate from a plane by amounts that differ by over 0.2 m and 6 %
+    of the nearest depth. With fewer than six pixels the depths themselves are compared.
 
     The pixel gets the depth of the weighted plane in inverse depth. The half size of the window
     grows in thirds of the ray spacing, then to ``reach`` spacings. The smallest sufficient window
@@ -328,43 +329,43 @@ def fill(record: MapRecord, reach: float) -> None:
     height, width = is_known.shape
     before = np.zeros((height, width + 1), np.int32)
     np.cumsum(is_known, axis=1, dtype=np.int32, out=before[:, 1:])
-    num = np.zeros((height + 1, width + 1), np.int32)
-    np.cumsum(before, axis=0, out=num[1:])
-    before += num[:-1, -1:]  # the pixels of the rows above
+    integral = np.zeros((height + 1, width + 1), np.int32)
+    np.cumsum(before, axis=0, out=integral[1:])
+    before += integral[:-1, -1:]  # the pixels of the rows above
     column = np.nonzero(is_known)[1].astype(np.int32)
-    known = _Known(before, num, column, inverse=1 / filled_m[is_known].astype(np.float64))
+    known = _Known(before, integral, column, inverse=1 / filled_m[is_known].astype(np.float64))
     _fill.over_rows(filled_m.size, known, record.spacing_px, reaches, filled_m, record.tilt)
     _reject_unconfirmed(record, ~is_known, _FILL_SHARE)
 
 
 @inlined
-def _has_known(num, top, bottom, left, right):  # type: ignore[no-untyped-def]
-    """Return True if a rectangle has known pixels, by the integral image ``num``."""
-    return num[bottom, right] - num[top, right] - num[bottom, left] + num[top, left] > 0
+def _has_known(total, top, bottom, left, right):  # type: ignore[no-untyped-def]
+    """Return True if a rectangle has known pixels, by the integral image ``total`` of them."""
+    return total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left] > 0
 
 
 @inlined
-def _is_surrounded(num, window, row, column):  # type: ignore[no-untyped-def]
+def _is_surrounded(integral, window, row, column):  # type: ignore[no-untyped-def]
     """Return True if a window has known pixels to the left, to the right, above and below."""
     top, bottom, left, right = window
     return (
-        _has_known(num, top, bottom, left, column)
-        and _has_known(num, top, bottom, column + 1, right)
-        and _has_known(num, top, row, left, right)
-        and _has_known(num, row + 1, bottom, left, right)
+        _has_known(integral, top, bottom, left, column)
+        and _has_known(integral, top, bottom, column + 1, right)
+        and _has_known(integral, top, row, left, right)
+        and _has_known(integral, row + 1, bottom, left, right)
     )
 
 
 @inlined
-def _sum_up(known, window, row, column, moments):  # type: ignore[no-untyped-def]
+def _sum_window(known, window, row, column, moments):  # type: ignore[no-untyped-def]
     """Fill in the ``moments`` (9,) of a window's known pixels, for `plane` around (row, column).
 
-    Returns their number, and the inverse depths (1/m) of the nearest and of the farthest.
+    Returned are their number, and the inverse depths (1/m) of the nearest and of the farthest one.
     """
     top, bottom, left, right = window
     # The image may cut the window on one side.
     reach_v, reach_u = max(row - top, bottom - 1 - row), max(column - left, right - 1 - column)
-    num, nearest, farthest = 0, 0.0, np.inf
+    num_known, nearest, farthest = 0, 0.0, np.inf
     moments[:] = 0.0
     for r in range(top, bottom):
         for k in range(known.before[r, left], known.before[r, right]):
@@ -372,8 +373,9 @@ def _sum_up(known, window, row, column, moments):  # type: ignore[no-untyped-def
             # The weight falls to 0 one pixel outside the window.
             weight = (1 - abs(dv) / (reach_v + 1)) * (1 - abs(du) / (reach_u + 1))
             add_moments(moments, weight, du, dv, inverse)
-            num, nearest, farthest = num + 1, max(nearest, inverse), min(farthest, inverse)
-    return num, nearest, farthest
+            num_known += 1
+            nearest, farthest = max(nearest, inverse), min(farthest, inverse)
+    return num_known, nearest, farthest
 
 
 @inlined
@@ -390,11 +392,11 @@ def _spread(known, window, row, column, centre, slope_u, slope_v):  # type: igno
 
 
 @Kernel
-def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
-    """Fill the empty pixels from ``first`` to ``last`` as in `fill`; reaches ascend."""
+def _fill(begin, end, known, spacing_px, reaches, filled_m, tilt):  # type: ignore[no-untyped-def]
+    """Interpolate empty pixels by the first sufficient window; ``reaches`` (spacings) ascend."""
     height, width = filled_m.shape
     moments = np.empty(9)
-    for p in range(first, last):
+    for p in range(begin, end):
         row, column = p // width, p % width
         if filled_m[row, column] > 0:
             continue
@@ -414,18 +416,18 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
                 max(column - reach_u, 0),
                 min(column + reach_u + 1, width),
             )
-            if not _is_surrounded(known.num, window, row, column):
+            if not _is_surrounded(known.integral, window, row, column):
                 continue
 
             # No depth discontinuity: few pixels are compared by their depths, more by a plane.
-            num, nearest, farthest = _sum_up(known, window, row, column, moments)
+            num_known, nearest, farthest = _sum_window(known, window, row, column, moments)
             allowed_m = max(HIDDEN_M, HIDDEN_FRACTION / nearest)
-            if num < _MIN_PLANE_PX and 1 / farthest - 1 / nearest > allowed_m:
+            if num_known < _MIN_PLANE_PX and 1 / farthest - 1 / nearest > allowed_m:
                 continue
             centre, slope_u, slope_v = plane(moments, _RIDGE_PX2)
             spread = _spread(known, window, row, column, centre, slope_u, slope_v)
-            # A difference of inverse depth (1/m), divided by its square, is one of depth (m).
-            if num >= _MIN_PLANE_PX and spread / (centre * centre) > allowed_m:
+            # A difference of inverse depth, over its square, is a difference of depth (m).
+            if num_known >= _MIN_PLANE_PX and spread / (centre * centre) > allowed_m:
                 continue
             if centre > 0:
                 filled_m[row, column] = 1 / centre
@@ -436,10 +438,10 @@ def _fill(first, last, known, spacing_px, reaches, filled_m, tilt):  # type: ign
 def fill_stars(record: MapRecord) -> None:
     """Fill holes from the first known pixel, measured or filled, in each of 16 directions.
 
-    At least eight directions need a known pixel within a ray spacing. At most seven directions in a
-    row may have none, or the depth would be extrapolated. The surfaces of the known pixels,
-    extended to the hole, must agree to 10 % of inverse depth. The pixel gets their mean, weighted
-    by the reciprocal of the number of steps. It needs eight tenths of the votes.
+    At least eight directions need a known pixel within a ray spacing. At most seven neighbouring
+    directions may have none, otherwise the depth would be extrapolated. The surfaces of the known
+    pixels, extended to the hole, must agree to 10 % of inverse depth. The hole gets their mean,
+    weighted by the reciprocal of the number of steps. A pixel needs eight tenths of the votes.
     """
     empty = record.filled_m == 0
     pixel = np.flatnonzero(empty)
@@ -461,14 +463,14 @@ def _widest_gap(met):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[no-untyped-def]
+def _star(begin, end, pixel, known, spacing_px, predicted_m):  # type: ignore[no-untyped-def]
     """Fill ``predicted_m`` (P,) with the depths of `fill_stars` at empty pixels, 0 for none."""
     width = known.inverse.shape[1]
     met = np.empty(len(DIRECTIONS), np.bool_)
-    for p in range(first, last):
+    for p in range(begin, end):
         row, column = pixel[p] // width, pixel[p] % width
         reach_px = max(spacing_px[row, column, 0], spacing_px[row, column, 1])
-        num, nearest, farthest = 0, 0.0, np.inf
+        num_met, nearest, farthest = 0, 0.0, np.inf
         weighted_sum, sum_weights = 0.0, 0.0
         for d in range(len(DIRECTIONS)):
             k = np.int64(known.steps[d, row, column])  # at least 1, as the pixel is empty
@@ -479,8 +481,8 @@ def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[n
                 nearest, farthest = max(nearest, inverse), min(farthest, inverse)
                 weighted_sum += inverse / k
                 sum_weights += 1 / k
-                num += 1
-        if num < _MIN_MET or _widest_gap(met) >= _OPEN_SIDE:
+                num_met += 1
+        if num_met < _MIN_MET or _widest_gap(met) >= _OPEN_SIDE:
             continue
         mean = weighted_sum / sum_weights
         if nearest - farthest <= _STAR_SPREAD * mean:
@@ -488,7 +490,7 @@ def _star(first, last, pixel, known, spacing_px, predicted_m):  # type: ignore[n
 
 
 def measure_spots(record: MapRecord) -> None:
-    """Count filled pixels as measured, in depth unchanged, if a return's laser spot covers them."""
+    """Mark filled pixels as measured, with their depth unchanged, if a laser spot covers them."""
     # The spot of the return that measured each pixel
     points = record.points
     measured = np.flatnonzero(record.depth_m > 0)
@@ -498,7 +500,7 @@ def measure_spots(record: MapRecord) -> None:
     radius_px = np.minimum(FOOTPRINT * points.spacing_px[point, 0], _SPOT_PX)
     uv = points.uv[point]
 
-    # Each covered pixel takes the source of the nearest such return.
+    # Each covered pixel takes the source of the return with the nearest spot.
     interpolated_m = np.where(record.depth_m == 0, record.filled_m, np.float32(0))
     source = np.full(interpolated_m.shape, -1)  # flat index of a measured pixel
     least_px2 = np.full(interpolated_m.shape, np.inf)
@@ -528,8 +530,8 @@ def _cover(pixel, uv, radius_px, depth_m, tilt, interpolated_m, source, least_px
                 px2 = (column - uv[i, 0]) ** 2 + (row - uv[i, 1]) ** 2
                 if px2 > radius_px[i] * radius_px[i] or px2 >= least_px2[row, column]:
                     continue
-                # The surface of the return, extended to the pixel, must have the depth of the fill.
-                # Compared are fill / surface - 1, and the tolerance as a share of the surface.
+                # The surface of the return, extended to the pixel, must have the filled depth:
+                # |fill / surface - 1| is at most the tolerance as a share of the surface.
                 inverse = 1 / return_m + (column - u) * tilt[v, u, 0] + (row - v) * tilt[v, u, 1]
                 tolerance_m = AGREE_M + AGREE_FRACTION * return_m
                 if abs(fill_m * inverse - 1) <= tolerance_m * abs(inverse):

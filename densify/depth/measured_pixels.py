@@ -96,16 +96,16 @@ class MapRecord:
 
     @property
     def gap_px(self) -> Float32:
-        """The (H,W) spacing of neighbouring rays, geometric mean of both directions."""
+        """The spacing (H,W) of neighbouring rays in px, geometric mean of both directions."""
         return np.sqrt(self.spacing_px[..., 0] * self.spacing_px[..., 1])
 
     def box(self, box: tuple[slice, slice]) -> MapRecord:
-        """Return a box of rows and columns as views: writing to the box changes this record."""
+        """Return the part of this record in a box of rows and columns, which shares its memory."""
         image_names = {field.name for field in fields(self)} - {"points", "reason", "evidence"}
         return replace(self, **{name: getattr(self, name)[box] for name in image_names})
 
     def reject(self, mask: Bool) -> None:
-        """Move the depths of a mask (H,W) to ``rejected_m``; measured ones become boundary."""
+        """Reject the pixels of a mask (H,W), in place. Measured pixels become boundary pixels."""
         rejected = mask & (self.filled_m > 0)
         np.copyto(self.boundary_m, self.depth_m, where=rejected & (self.depth_m > 0))
         np.copyto(self.rejected_m, self.filled_m, where=rejected)
@@ -114,19 +114,19 @@ class MapRecord:
 
 
 def measure(inputs: MapInputs) -> MapRecord:
-    """Return the record of a map's measured and boundary pixels, nothing interpolated or rejected.
+    """Return the record of a map with its measured and boundary pixels, nothing interpolated.
 
-    Points beyond the window only measure what it leaves empty, away from depth discontinuities.
-    Without ``visibility`` in the settings each pixel takes its nearest point.
+    Points beyond the window measure only pixels that the window leaves empty, away from depth
+    discontinuities. Without ``visibility`` in the settings each pixel takes its nearest point.
     """
     camera = inputs.view.exposure.camera
     shape = (camera.height_px, camera.width_px)
     points = points_in_image(inputs.cloud, inputs.view, inputs.patches)
     in_window = select_rows(points, ~points.far) if points.far.any() else points
     no_image = np.zeros((0, 0, 3), np.float32)
-    empty = ("depth_m", "boundary_m", "filled_m", "rejected_m", "confidence", "edge")
+    zero_images = ("depth_m", "boundary_m", "filled_m", "rejected_m", "confidence", "edge")
     record = MapRecord(
-        **{name: np.zeros(shape, np.float32) for name in empty},
+        **{name: np.zeros(shape, np.float32) for name in zero_images},
         point=np.full(shape, -1, np.int32),
         tilt=np.zeros((*shape, 2), np.float32),
         # Of the window's sweeps, unless none of their points is in view
@@ -147,7 +147,7 @@ def measure(inputs: MapInputs) -> MapRecord:
 
 
 def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
-    """Return the (H,W,2) spacing of rays across and down in px, means over blocks of pixels."""
+    """Return the (H,W,2) spacing of rays across and down in px, a mean over each block."""
     height, width = (-(-size // _BLOCK_PX) for size in shape)  # in blocks, rounded up
     row, column = pixel_of(points.uv)
     block = row // _BLOCK_PX * width + column // _BLOCK_PX
@@ -162,8 +162,8 @@ def _spacing_px(points: PointsInImage, shape: tuple[int, int]) -> Float32:
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     blocks = mean.reshape(height, width, 2)[tuple(nearest)]
 
-    # A block takes the downward spacing of the block above or below if that is far larger: the hole
-    # below the last of a scanner's denser rings is as wide.
+    # A block takes the downward spacing of the block above or below if the other spacing is far
+    # larger: the hole below the last of a scanner's denser rings is as wide.
     down_px = blocks[..., 1]
     widest_px = ndimage.maximum_filter1d(down_px, 3, axis=0)
     blocks[..., 1] = np.where(widest_px > _JUMP * down_px, widest_px, down_px)
@@ -190,7 +190,8 @@ def _measure_nearest(record: MapRecord) -> None:
 def _measure_visible(record: MapRecord, points: PointsInImage, beyond_window: bool = False) -> None:
     """Measure pixels without a depth by visible points, and set the reason of each point.
 
-    The points are those of the window, or with ``beyond_window`` all, of which the window's stay.
+    The points are those of the window, or with ``beyond_window`` all points. Pixels that the window
+    measured, and reasons of its points, stay.
     """
     shape = record.depth_m.shape
     is_hidden = is_occluded(points, shape)
@@ -199,21 +200,21 @@ def _measure_visible(record: MapRecord, points: PointsInImage, beyond_window: bo
     rank = np.where(is_hidden, hidden_rank, points.age_ns)
     start, order = sorted_by_pixel(points, rank, shape)
     by_pixel = _ByPixel(select_rows(points, order), is_hidden[order], start, shape)
-    values = np.zeros((4, record.depth_m.size), np.float32)
-    _measure_pixels.over_rows(record.depth_m.size, by_pixel, record.depth_m.ravel() > 0, values)
-    pixel = np.flatnonzero(values[0])
+    all_pixels = _Measurements(*np.zeros((4, record.depth_m.size), np.float32))
+    _measure_pixels.over_rows(record.depth_m.size, by_pixel, record.depth_m.ravel() > 0, all_pixels)
+    pixel = np.flatnonzero(all_pixels.depth_m)
     winner = order[start[pixel]]
-    depth_m, num_sweeps, is_nearest_in_time, edge = values[:, pixel]
+    depth_m, num_sweeps, agrees_nearest, edge = (column[pixel] for column in all_pixels)
 
     reasons = np.where(is_hidden, Reason.HIDDEN, Reason.NOT_CHOSEN).astype(np.uint8)
     if beyond_window:
-        # The sweep nearest to the key need not agree, but six sweeps must, and there are no
-        # boundary pixels.
+        # The sweep nearest to the key need not agree, but six sweeps must. Pixels close to a depth
+        # discontinuity stay empty.
         is_supported, is_inside = num_sweeps >= _FAR_SWEEPS, edge >= _FAR_EDGE
         is_used = is_supported & is_inside
         reasons[winner[~is_inside]] = Reason.EDGE
     else:
-        is_used = is_supported = is_nearest_in_time > 0
+        is_used = is_supported = agrees_nearest > 0
         is_inside = edge >= 1  # else it is a boundary pixel
     reasons[winner[~is_supported]] = Reason.UNSUPPORTED
     is_judged = points.far == beyond_window
@@ -225,6 +226,15 @@ def _measure_visible(record: MapRecord, points: PointsInImage, beyond_window: bo
     record.edge.flat[used] = edge[is_used]
     record.point.flat[used] = points.rows[winner[is_used]]
     record.tilt.reshape(-1, 2)[used] = points.slope[winner[is_used]]
+
+
+class _Measurements(NamedTuple):
+    """Measured values of the P pixels of an image, (P,) float32 each."""
+
+    depth_m: Float32  # depth at the pixel's centre, 0 without a visible point
+    num_sweeps: Float32  # number of sweeps that agree with the winner
+    agrees_nearest: Float32  # 1 if the sweep nearest to the key, of those around, is one of them
+    edge: Float32  # distance from a depth discontinuity in radii of a laser's spot
 
 
 class _ByPixel(NamedTuple):
@@ -254,7 +264,7 @@ def _extend(extent, u, v):  # type: ignore[no-untyped-def]
 
 @inlined
 def _count(bits):  # type: ignore[no-untyped-def]
-    """Return the number of bits that are set, each for a sweep."""
+    """Return the number of sweeps in a bit set."""
     num_sweeps = 0
     while bits:
         num_sweeps += bits & 1
@@ -268,25 +278,25 @@ def _compare(by_pixel, winner, u0, v0, centre, tolerance, edge_px, moments, exte
 
     The plane has the inverse depth ``centre`` (1/m) at the pixel. A point agrees if it deviates by
     at most ``tolerance`` (1/m). Its deviation is added to ``moments`` (9,). In a square of half
-    size ``edge_px`` it raises ``extent`` (8,).
+    size ``edge_px`` an agreeing point raises ``extent`` (8,).
 
     Returns:
         sweeps: Bit set of the agreeing sweeps in the window.
-        is_nearest_in_time: True if no other sweep in the window is nearer in time to the key.
+        agrees_nearest: True if no other sweep in the window is nearer in time to the key.
         has_background: True if a point in the square is clearly behind the plane.
     """
     points, is_hidden, start, shape = by_pixel
     uv, inverse, age_ns = points.uv, points.inverse, points.age_ns
     slope_u, slope_v = points.slope[winner, 0], points.slope[winner, 1]
-    # A step of depth (m), times the squared inverse depth, is one of inverse depth (1/m).
+    # A step of depth (m), times the squared inverse depth, is a step of inverse depth (1/m).
     background_step = HIDDEN_M + HIDDEN_FRACTION / inverse[winner]
     background_step = background_step * inverse[winner] * inverse[winner]
-    # The window of the pixel. The search covers it and the square.
+    # The window of the pixel. The search covers the window and the square.
     reach_u = _window(_REACH * points.spacing_px[winner, 0])
     reach_v = _window(_REACH * points.spacing_px[winner, 1])
     wide_u, wide_v = max(reach_u, _window(edge_px)), max(reach_v, _window(edge_px))
     sweeps, has_background = np.int64(0), False
-    # Least age of a sweep that agrees, and of one that does not; at least the winner itself agrees.
+    # Least age of an agreeing sweep, and of another sweep. At least the winner itself agrees.
     agreeing_ns = other_ns = age_ns[winner]
     left, right = max(u0 - wide_u, 0), min(u0 + wide_u, shape[1] - 1)
     for v in range(max(v0 - wide_v, 0), min(v0 + wide_v, shape[0] - 1) + 1):
@@ -313,16 +323,11 @@ def _compare(by_pixel, winner, u0, v0, centre, tolerance, edge_px, moments, exte
 
 
 @Kernel
-def _measure_pixels(first, last, by_pixel, has_depth, values):  # type: ignore[no-untyped-def]
-    """Fill ``values`` (4,P) at pixels without a depth that have a visible point.
-
-    They are the depth at the pixel's centre, the number of sweeps that agree, 1 if the sweep
-    nearest to the key of those around is among them, and the distance from a depth discontinuity in
-    radii of a laser's spot.
-    """
+def _measure_pixels(begin, end, by_pixel, has_depth, measurements):  # type: ignore[no-untyped-def]
+    """Fill the `_Measurements` of pixels without a depth that have a visible point."""
     moments, extent = np.empty(9), np.empty(8)
     points, start, width = by_pixel.points, by_pixel.start, by_pixel.shape[1]
-    for p in range(first, last):
+    for p in range(begin, end):
         # The first point of a pixel wins, unless there is none or only occluded ones.
         winner = start[p]
         if has_depth[p] or winner == start[p + 1] or by_pixel.is_hidden[winner]:
@@ -332,22 +337,22 @@ def _measure_pixels(first, last, by_pixel, has_depth, values):  # type: ignore[n
         v0, u0 = p // width, p % width
         inverse, uv, slope = points.inverse[winner], points.uv[winner], points.slope[winner]
         centre = inverse + slope[0] * (u0 - uv[0]) + slope[1] * (v0 - uv[1])
-        # From a tolerance of depth (m) to one of inverse depth (1/m)
+        # From a tolerance of depth (m) to a tolerance of inverse depth (1/m)
         tolerance = (AGREE_M + AGREE_FRACTION / inverse) * inverse * inverse
         slack_px = _SLACK_M * points.focal_px[winner, 0] * inverse
         spot_px = FOOTPRINT * points.spacing_px[winner, 0] + slack_px
 
-        # The depth: that plane, corrected at the pixel's centre. The correction is the value there
-        # of a second plane, through the deviations of the agreeing points from the first.
+        # The depth is that of the tangent plane, corrected by a second plane. The second plane is
+        # fitted to the deviations of the agreeing points from the first, and counts at the centre.
         moments[:], extent[:] = 0.0, 0.0
-        sweeps, is_nearest_in_time, has_background = _compare(
+        sweeps, agrees_nearest, has_background = _compare(
             by_pixel, winner, u0, v0, centre, tolerance, spot_px + _EDGE_WINDOW_PX, moments, extent
         )
         deviation, _, _ = plane(moments, _RIDGE_PX2)
         deviation = min(max(deviation, -tolerance), tolerance)
-        values[0, p] = 1 / limit_inverse(centre + deviation, inverse)
-        values[1, p] = _count(sweeps)
-        values[2, p] = is_nearest_in_time
+        measurements.depth_m[p] = 1 / limit_inverse(centre + deviation, inverse)
+        measurements.num_sweeps[p] = _count(sweeps)
+        measurements.agrees_nearest[p] = agrees_nearest
         # The discontinuity is where the surface ends first.
         is_near_edge = has_background and spot_px > 0
-        values[3, p] = extent.min() / spot_px if is_near_edge else ALL_ROUND
+        measurements.edge[p] = extent.min() / spot_px if is_near_edge else ALL_ROUND

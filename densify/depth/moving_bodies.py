@@ -40,11 +40,11 @@ _AGREES = 2.0  # tolerance, as a multiple of that between two static points of a
 def close_bodies(
     record: MapRecord, cloud: Cloud, exposure: Exposure, bodies: Mapping[int, MovingBody]
 ) -> None:
-    """Put the surfaces of moving bodies into the record, in place; ``on_body`` marks their pixels.
+    """Put the surfaces of moving bodies into the record, in place, and mark them in ``on_body``.
 
-    Depths clearly in front stay. Elsewhere inside the outline of a hull only depths of moving
-    objects stay. Pixels with a return of the body on its surface count as measured. ``bodies`` are
-    by instance number.
+    Depths clearly in front of a body stay. Elsewhere inside the outline of a hull only depths of
+    moving objects stay. Pixels with a return of the body on its surface count as measured.
+    ``bodies`` are by instance number.
     """
     margin_px = round(VOTERS_REACH * float(np.median(record.gap_px)))
     for instance, body in bodies.items():
@@ -55,14 +55,14 @@ def close_bodies(
 
 
 def find_far_inside(bodies: Iterable[MovingBody], exposure: Exposure, depth_m: Float32) -> Bool:
-    """Return (H,W) True where ``depth_m`` (H,W) is over 0.6 m behind the front of a body."""
+    """Return the mask (H,W) of depths ``depth_m`` (H,W) over 0.6 m behind the front of a body."""
     inverse = fronts(bodies, exposure)
-    # depth > front + _DEEP_M, times the inverse depth of the front
+    # The test is depth > front + _DEEP_M, times the inverse depth of the front.
     return (inverse > 0) & (depth_m * inverse > 1 + _DEEP_M * inverse)
 
 
 def fronts(bodies: Iterable[MovingBody], exposure: Exposure) -> Float:
-    """Return the (H,W) inverse depths (1/m) of the bodies' nearest front in a view, 0 for none."""
+    """Return the inverse depths (H,W) in 1/m of the nearest surface of all hulls, 0 for none."""
     inverse = np.zeros((exposure.camera.height_px, exposure.camera.width_px))
     for body in bodies:
         front = _Front.of(body, exposure, 0)
@@ -88,9 +88,9 @@ class _Front(NamedTuple):
         high = np.array([camera.width_px, camera.height_px])
         # A hull that reaches behind the camera may cover the whole image.
         if (exposure.depth_m(sight.points_cam) > cameras.NEAREST_M).all():
-            first = np.floor(np.nanmin(sight.uv, axis=0)).astype(int)
-            end = np.ceil(np.nanmax(sight.uv, axis=0)).astype(int) + 1  # exclusive
-            low, high = np.maximum(low, first - margin_px), np.minimum(high, end + margin_px)
+            least_uv = np.floor(np.nanmin(sight.uv, axis=0)).astype(int)
+            end_uv = np.ceil(np.nanmax(sight.uv, axis=0)).astype(int) + 1  # exclusive
+            low, high = np.maximum(low, least_uv - margin_px), np.minimum(high, end_uv + margin_px)
         box = slice(low[1], high[1]), slice(low[0], high[0])
         row, column = np.mgrid[box]
 
@@ -146,66 +146,74 @@ class _Front(NamedTuple):
 def _close(
     record: MapRecord, cloud: Cloud, exposure: Exposure, rows: Int, body: MovingBody, front: _Front
 ) -> None:
-    """Put a body, with points at ``rows`` of the cloud, into a record cut to the front's box."""
-    inside = front.inverse > 0
-    measured_m = np.maximum(record.depth_m, record.boundary_m)
-    on_body = inside & (measured_m > 0) & np.isin(record.point, rows)
-    # Returns from deep inside, such as those from seats, are not on the surface: the test is
-    # measured_m < front + _DEEP_M, times the inverse depth of the front.
-    on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
-    # The surface is the front of the hull, with a smooth offset through the returns.
-    offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
-    surface = np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)  # 1/m
+    """Put a body into a record cut to the front's box, in place: ``rows`` are its cloud points."""
+    surface = _fit_surface(record, rows, front)
     surface_m = (1 / surface).astype(np.float32)
     allowed_m = _AGREES * agree_m(surface_m)
-    share = front.closed_share(body, exposure, record.spacing_px)
-    shown, measurable = _show(record, cloud, surface, allowed_m, share)
+    closed_share = front.closed_share(body, exposure, record.spacing_px)
+    is_shown, may_be_measured = _show(record, cloud, surface, allowed_m, closed_share)
 
     # Returns of the body on its surface
     point, pixel, depth_m = front.pixels(exposure, cloud.points[rows], cloud.velocity_m_s[rows])
     error_m = abs(depth_m - surface_m[pixel])
-    agrees = measurable[pixel] & (error_m <= allowed_m[pixel])
+    agrees = may_be_measured[pixel] & (error_m <= allowed_m[pixel])
     row, column = (index[agrees] for index in pixel)
     agreeing_rows = rows[point[agrees]]
 
-    # The oldest return is written first, so the one nearest to the key in time stays.
+    # The oldest return is written first, so the return nearest to the key in time stays.
     oldest_first = np.argsort(-abs(cloud.since_key_ns[agreeing_rows]), kind="stable")
     source = np.full(surface.shape, -1)
     source[row[oldest_first], column[oldest_first]] = agreeing_rows[oldest_first]
-    measured = source >= 0
-    record.depth_m[shown] = np.where(measured, surface_m, 0)[shown]
-    record.point[measured] = source[measured]
+    is_measured = source >= 0
+    record.depth_m[is_shown] = np.where(is_measured, surface_m, 0)[is_shown]
+    record.point[is_measured] = source[is_measured]
+
+
+def _fit_surface(record: MapRecord, rows: Int, front: _Front) -> Float:
+    """Return the (h,w) inverse depth (1/m) of a body's surface, from its cloud points ``rows``."""
+    inside = front.inverse > 0
+    measured_m = np.maximum(record.depth_m, record.boundary_m)
+    on_body = inside & (measured_m > 0) & np.isin(record.point, rows)
+    # Returns from deep inside, such as returns from seats, are not on the surface: the test is
+    # measured_m < front + _DEEP_M, times the inverse depth of the front.
+    on_body &= measured_m * front.inverse < 1 + _DEEP_M * front.inverse
+    # The surface is the front of the hull, with a smooth offset through the returns.
+    offset = 1 / np.where(on_body, measured_m, 1) - front.inverse
+    return np.maximum(front.inverse + _smooth(offset, on_body, inside), 1e-3)  # at most 1 km away
 
 
 def _show(
-    record: MapRecord, cloud: Cloud, surface: Float, allowed_m: Float | Float32, share: Float
+    record: MapRecord, cloud: Cloud, surface: Float, allowed_m: Float | Float32, closed_share: Float
 ) -> tuple[Bool, Bool]:
-    """Show a body's surface (h,w), 1/m, in the record.
+    """Show a body's surface (h,w), inverse depth in 1/m, in a record, in place.
 
-    Returns of moving objects up to ``allowed_m`` (h,w) behind it stay. ``share`` (h,w) is that of
-    the rays that end on the body, 0 outside its hull. Returned are two (h,w) masks: where the body
-    is shown, and where its returns count as measured.
+    Returns of moving objects up to ``allowed_m`` (h,w) behind the surface stay. ``closed_share``
+    (h,w) is the share of the rays that end on the body, 0 outside the hull.
+
+    Returns:
+        is_shown: (h,w) True where the record shows the body.
+        may_be_measured: (h,w) True where returns of the body count as measured.
     """
-    inside = share > 0
+    inside = closed_share > 0
     surface_m = (1 / surface).astype(np.float32)
-    is_compact = (share[inside] >= _LEAST_OF_OTHER).mean() >= _COMPACT
+    is_compact = (closed_share[inside] >= _LEAST_OF_OTHER).mean() >= _COMPACT
 
     # The core, well inside the closed part, shows the body, unless something is in front.
     is_hidden = (record.filled_m > 0) & (record.filled_m < surface_m - hidden_m(surface_m))
-    is_closed = share >= (_LEAST_OF_COMPACT if is_compact else _LEAST_OF_OTHER)
+    is_closed = closed_share >= (_LEAST_OF_COMPACT if is_compact else _LEAST_OF_OTHER)
     core = _erode(is_closed, float(np.median(record.gap_px[inside]))) & ~is_hidden
     record.filled_m[core] = surface_m[core]
     record.votes[core] = 1
     slope_down, slope_right = np.gradient(surface)
     record.tilt[core] = np.stack([slope_right, slope_down], axis=-1)[core]
 
-    # The outline is the rest of the front: it may show the body or what is behind. It loses all
-    # depths but those of moving objects in front of the surface, or on it.
+    # The outline is the other part of the front, which may show the body or the background. All
+    # depths are removed, except those of moving objects in front of the surface or on the surface.
     is_moving = (record.depth_m > 0) & cloud.moving[record.point]
     stays = is_moving & (record.depth_m <= surface_m + allowed_m)
     outline = inside & ~is_hidden & ~core & ~stays
     if not is_compact:
-        outline &= share >= _LEAST_OF_COMPACT
+        outline &= closed_share >= _LEAST_OF_COMPACT
     for layer_m in (record.depth_m, record.filled_m, record.rejected_m):
         layer_m[outline] = 0  # a background seen past a moving object is not given back
 
@@ -215,12 +223,12 @@ def _show(
         record, [record.filled_m], pixel, surface_m[outline], with_shifts=not is_compact
     )
     least_share = _VOTES_OF_COMPACT if is_compact else LEAST_SHARE
-    shown = core.copy()
-    shown[outline] = votes >= ROUNDED * least_share
+    is_shown = core.copy()
+    is_shown[outline] = votes >= ROUNDED * least_share
     record.votes[outline] = votes
-    record.filled_m[shown] = surface_m[shown]
-    record.on_body |= shown
-    return shown, shown if is_compact else core
+    record.filled_m[is_shown] = surface_m[is_shown]
+    record.on_body |= is_shown
+    return is_shown, is_shown if is_compact else core
 
 
 def _erode(mask: Bool, margin_px: float) -> Bool:
@@ -233,17 +241,19 @@ def _erode(mask: Bool, margin_px: float) -> Bool:
 
 def _smooth(offset: Float, known: Bool, inside: Bool) -> Float:
     """Return the (h,w) smooth offset (1/m) inside a body's outline, near the ``known`` offsets."""
-    # Pairs of neighbouring pixels inside, by their numbers
+    # Pairs of neighbouring pixels inside, by the pixels' numbers
     number = np.cumsum(inside).reshape(inside.shape) - 1
     pair_right = inside[:, :-1] & inside[:, 1:]
     pair_down = inside[:-1] & inside[1:]
-    first = np.concatenate([number[:, :-1][pair_right], number[:-1][pair_down]])
-    second = np.concatenate([number[:, 1:][pair_right], number[1:][pair_down]])
+    left_or_upper = np.concatenate([number[:, :-1][pair_right], number[:-1][pair_down]])
+    right_or_lower = np.concatenate([number[:, 1:][pair_right], number[1:][pair_down]])
     shape = (int(inside.sum()),) * 2
-    half = sparse.coo_matrix((np.full(len(first), _SMOOTHNESS), (first, second)), shape).tocsr()
+    weights = np.full(len(left_or_upper), _SMOOTHNESS)
+    half = sparse.coo_matrix((weights, (left_or_upper, right_or_lower)), shape).tocsr()
     ties = half + half.T  # symmetric
 
-    # The offset o minimises Σ known (o - offset)² + _SMOOTHNESS Σ |∇o|² + _TOWARDS_HULL Σ o².
+    # The offset o minimises Σ known (o - offset)² + _SMOOTHNESS Σ |∇o|² + _TOWARDS_HULL Σ o². The
+    # derivatives by o are 0 where system @ o = known · offset.
     weight = known[inside].astype(np.float64)
     diagonal = np.asarray(ties.sum(axis=1)).ravel() + weight + _TOWARDS_HULL
     system = (sparse.diags(diagonal) - ties).tocsr()

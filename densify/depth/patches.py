@@ -33,31 +33,32 @@ _BEND = 0.25  # greatest change of the slope on one curved surface, as a share o
 # Neighbours of a point of an unordered scanner: radius in spacings of rays, and its limit in cells
 _RADIUS, _MOST_CELLS = 5.0, 20
 _RIDGE = 0.005  # ridge of planes, as a share of the sum of the neighbours' squared distances
-_MOST_RATIO = 1.4  # greatest ratio of the extended inverse depth and that at the start
+_MOST_RATIO = 1.4  # greatest ratio of an extended inverse depth to the inverse depth at its start
+_AZIMUTH, _ELEVATION, _RANGE = range(3)  # rows of ``spherical``
 
 
 def agree_m(depth_m: Float | Float32) -> Float | Float32:
-    """Return the greatest deviation between points on one surface at these depths."""
+    """Return the greatest deviation in metres between points on one surface, at depths in m."""
     return AGREE_M + AGREE_FRACTION * depth_m
 
 
 def hidden_m(surface_m: Float | Float32) -> Float | Float32:
-    """Return the distance behind surfaces at these depths from which points are occluded."""
+    """Return the distance in metres behind surfaces, at depths in m, that occludes points."""
     return HIDDEN_M + HIDDEN_FRACTION * surface_m
 
 
 def find_patches(
     cloud: Cloud, sensors: Sensors, origins: Mapping[int, Float], wanted: Bool | None = None
 ) -> Patches:
-    """Return the surface patches of a cloud by `fit_tangents`.
+    """Return the surface patch of each of M points of a cloud, tangent to the neighbouring points.
 
-    ``origins`` are the (S,3) origins of the scanners of each sweep, by its frame number, in the key
-    sweep's lidar frame.
+    ``origins`` are the scanners' origins (S,3) by a sweep's frame number, key sweep's lidar frame.
+    Only ``wanted`` (M,) points get a patch, others get zeros. None means all.
     """
     frames, index = np.unique(cloud.frame, return_inverse=True)
     sweep: NDArray[np.int32] = index.astype(np.int32)
     sweep_origins = [origins[frame] for frame in frames.tolist()]
-    # In the rigid points the objects have the shape that each sweep measured.
+    # In the rigid points a moving object has the shape that each sweep measured.
     return fit_tangents(cloud.rigid_points, cloud.lidar, sweep, sensors, sweep_origins, wanted)
 
 
@@ -69,9 +70,9 @@ def fit_tangents(
     origins: Sequence[Float],
     wanted: Bool | None = None,
 ) -> Patches:
-    """Return the patches of M points, each tangent to the neighbours in its scanner's sweep.
+    """Return the patches of M points, each tangent to the neighbours that its scanner measured.
 
-    A point p is on the tangent plane if normal · (p - origin) = 1. If the neighbours are on no
+    A position x is on the tangent plane if normal · (x - origin) = 1. If the neighbours are on no
     single surface, the patch faces the scanner. Spacings are metres between neighbouring rays,
     along the azimuth and along the elevation.
 
@@ -107,21 +108,21 @@ def fit_tangents(
 
 
 @Kernel
-def _to_spherical(first, last, points, origins, scan, spherical):  # type: ignore[no-untyped-def]
+def _to_spherical(begin, end, points, origins, scan, spherical):  # type: ignore[no-untyped-def]
     """Fill ``spherical`` (3,N): azimuth, elevation (rad) and range (m) from each scan's origin."""
-    for i in range(first, last):
+    for i in range(begin, end):
         x = points[i, 0] - origins[scan[i], 0]
         y = points[i, 1] - origins[scan[i], 1]
         z = points[i, 2] - origins[scan[i], 2]
         horizontal_m = np.sqrt(x * x + y * y)
-        spherical[0, i] = np.arctan2(y, x)
-        spherical[1, i] = np.arctan2(z, horizontal_m)
-        spherical[2, i] = np.sqrt(horizontal_m * horizontal_m + z * z)
+        spherical[_AZIMUTH, i] = np.arctan2(y, x)
+        spherical[_ELEVATION, i] = np.arctan2(z, horizontal_m)
+        spherical[_RANGE, i] = np.sqrt(horizontal_m * horizontal_m + z * z)
 
 
 @inlined
 def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
-    """Return row and column of a direction (rad) in a `densify.free_space.sensor.RayGrid`."""
+    """Return the row and the column of a direction (rad) in a grid of directions, a `RayGrid`."""
     # The row is interpolated between the borders of the elevation's bin.
     bin_position = (elevation - grid.low_rad) / grid.bin_rad
     index = min(max(int(bin_position), 0), len(grid.row_of) - 2)
@@ -134,7 +135,7 @@ def _cell(azimuth, elevation, grid):  # type: ignore[no-untyped-def]
 
 @inlined
 def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
-    """Return the angles (rad) to the next ray along azimuth and elevation, from a `RayTable`."""
+    """Return the angles (rad) to the next ray along azimuth and along elevation, by a table."""
     rows, columns = table.elevation_gap_rad.shape
     row = min(max(int((elevation - table.low_rad) / table.bin_rad), 0), rows - 1)
     column = int((azimuth + np.pi) * (columns / (2 * np.pi))) % columns
@@ -142,29 +143,29 @@ def _spacing(azimuth, elevation, table):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _before(spherical, i, j):  # type: ignore[no-untyped-def]
-    """Return True if point i is nearer than j. The direction decides ties, not the order."""
-    if spherical[2, i] != spherical[2, j]:
-        return spherical[2, i] < spherical[2, j]
-    if spherical[0, i] != spherical[0, j]:
-        return spherical[0, i] < spherical[0, j]
-    return spherical[1, i] < spherical[1, j]
+def _is_nearer(spherical, i, j):  # type: ignore[no-untyped-def]
+    """Return True if point i is nearer than point j. The direction decides ties, not the order."""
+    if spherical[_RANGE, i] != spherical[_RANGE, j]:
+        return spherical[_RANGE, i] < spherical[_RANGE, j]
+    if spherical[_AZIMUTH, i] != spherical[_AZIMUTH, j]:
+        return spherical[_AZIMUTH, i] < spherical[_AZIMUTH, j]
+    return spherical[_ELEVATION, i] < spherical[_ELEVATION, j]
 
 
 @Kernel
 def _nearest_in_cells(spherical, rows, grid, cells):  # type: ignore[no-untyped-def]
-    """Fill ``cells`` (R,C) with the index of the nearest point of ``rows`` in each, -1 none."""
+    """Fill ``cells`` (R,C) with the index of the nearest point of ``rows`` in each, -1 if none."""
     cells[:] = -1
     for i in rows:
-        row, column = _cell(spherical[0, i], spherical[1, i], grid)
+        row, column = _cell(spherical[_AZIMUTH, i], spherical[_ELEVATION, i], grid)
         nearest = cells[row, column]
-        if nearest < 0 or _before(spherical, i, nearest):
+        if nearest < 0 or _is_nearer(spherical, i, nearest):
             cells[row, column] = i
 
 
 @inlined
 def _first_filled(cells, row, column, row_offsets, column_offsets):  # type: ignore[no-untyped-def]
-    """Return the index of the point in the first filled cell at the given offsets, -1 none."""
+    """Return the index of the point in the first filled cell at the given offsets, -1 if none."""
     for k in range(len(row_offsets)):
         neighbour_row = row + row_offsets[k]
         if 0 <= neighbour_row < cells.shape[0]:
@@ -176,42 +177,45 @@ def _first_filled(cells, row, column, row_offsets, column_offsets):  # type: ign
 
 @inlined
 def _slope(slope_a, slope_b, step_rad, range_m):  # type: ignore[no-untyped-def]
-    """Return the slope of inverse range per radian from those to both sides, NaN if unknown."""
+    """Return the slope of inverse range per radian from the slopes to both sides, 0 if unknown."""
     # The change of range (m) to a neighbour, step_rad away, is range² · slope · step.
     metres = step_rad * range_m * range_m
-    # The mean on one surface, else the lesser slope, or 0 if that is a step in depth
+    # The mean on one surface, else the lesser slope, or 0 if the lesser slope is a step in depth
     if abs(slope_a - slope_b) * metres <= AGREE_M + _BEND * abs(slope_a + slope_b) * metres:
         return 0.5 * (slope_a + slope_b)
-    if not abs(slope_a) <= abs(slope_b):  # also if slope_a or both are NaN
+    if not abs(slope_a) <= abs(slope_b):  # also if one of them is NaN
         slope_a = slope_b
-    return slope_a if abs(slope_a) * range_m <= _STEEP else 0.0
+    return slope_a if abs(slope_a) * range_m <= _STEEP else 0.0  # 0 for NaN, too
 
 
 @inlined
 def _slope_to(spherical, i, j, axis, other_axis, other_slope):  # type: ignore[no-untyped-def]
     """Return the slope of inverse range per radian along ``axis`` from point i to neighbour j.
 
-    The change along the other axis, of known slope, is subtracted. Axis 0 is the azimuth, 1 the
-    elevation. The slope is NaN without a neighbour (j < 0), or if both have equal angles.
+    The change along the other axis, of known slope, is subtracted. Axes are ``_AZIMUTH`` and
+    ``_ELEVATION``. The slope is NaN without a neighbour (j < 0), or if both have equal angles.
     """
     if j < 0:
         return np.nan
     angle = spherical[axis, j] - spherical[axis, i]
-    if axis == 0:
+    if axis == _AZIMUTH:
         angle -= 2 * np.pi * np.rint(angle / (2 * np.pi))  # azimuths wrap around
-    if abs(angle) < 1e-5:
+    if abs(angle) < 1e-5:  # rounding errors would decide the slope
         return np.nan
+    # 1 / range changes by slope · angle + other slope · other angle.
     other_angle = spherical[other_axis, j] - spherical[other_axis, i]
-    return (1 / spherical[2, j] - 1 / spherical[2, i] - other_slope * other_angle) / angle
+    change = 1 / spherical[_RANGE, j] - 1 / spherical[_RANGE, i]
+    return (change - other_slope * other_angle) / angle
 
 
 @inlined
 def _put(i, spherical, table, azimuth_slope, elevation_slope, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill in normal and spacing of point i from its slopes of inverse range per radian."""
-    azimuth, elevation, range_m = spherical[0, i], spherical[1, i], spherical[2, i]
+    azimuth, elevation = spherical[_AZIMUTH, i], spherical[_ELEVATION, i]
+    range_m = spherical[_RANGE, i]
     azimuth_gap, elevation_gap = _spacing(azimuth, elevation, table)
-    # The components of the normal along the ray, to its left and upwards are the inverse range,
-    # and its slopes per radian on the sphere: there a radian of azimuth is shorter.
+    # The components of the normal along the ray, to the left and upwards are the inverse range, and
+    # its slopes per radian on the sphere, where a radian of azimuth is shorter.
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     to_left = azimuth_slope / max(ce, 1e-3)
     normal[i, 0] = ce * ca / range_m - to_left * sa - elevation_slope * se * ca
@@ -222,7 +226,7 @@ def _put(i, spherical, table, azimuth_slope, elevation_slope, normal, spacing): 
 
 
 @Kernel
-def _fit_on_rings(first, last, rows, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+def _fit_on_rings(begin, end, rows, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
     """Fill normal (N,3) and spacing (N,2) of points by neighbours on the ring, above and below."""
     # Offsets of the cells in which a neighbour is looked for, in this order. Noise of the range
     # matters less over two steps.
@@ -230,73 +234,90 @@ def _fit_on_rings(first, last, rows, spherical, table, grid, cells, normal, spac
     same_row = np.array([0, 0, 0])
     up, down = np.array([1, 1, 1, 2]), np.array([-1, -1, -1, -2])
     beside = np.array([0, 1, -1, 0])
-    for k in range(first, last):
+    for k in range(begin, end):
         i = rows[k]
-        azimuth_gap, elevation_gap = _spacing(spherical[0, i], spherical[1, i], table)
-        # The table has angles on the sphere; the difference in azimuth is larger.
-        step_rad = azimuth_gap / max(np.cos(spherical[1, i]), 1e-3)
-        row, column = _cell(spherical[0, i], spherical[1, i], grid)
+        azimuth, elevation = spherical[_AZIMUTH, i], spherical[_ELEVATION, i]
+        range_m = spherical[_RANGE, i]
+        azimuth_gap, elevation_gap = _spacing(azimuth, elevation, table)
+        # The table has angles on the sphere. The difference in azimuth is larger.
+        step_rad = azimuth_gap / max(np.cos(elevation), 1e-3)
+        row, column = _cell(azimuth, elevation, grid)
 
+        # A neighbour is usually two steps away. Along the ring the elevation hardly changes.
         on_right = _first_filled(cells, row, column, same_row, right)
         on_left = _first_filled(cells, row, column, same_row, left)
-        slope_right = _slope_to(spherical, i, on_right, 0, 1, 0.0)
-        slope_left = _slope_to(spherical, i, on_left, 0, 1, 0.0)
-        azimuth_slope = _slope(slope_right, slope_left, 2 * step_rad, spherical[2, i])
-        azimuth_slope = 0.0 if np.isnan(azimuth_slope) else azimuth_slope
+        slope_right = _slope_to(spherical, i, on_right, _AZIMUTH, _ELEVATION, 0.0)
+        slope_left = _slope_to(spherical, i, on_left, _AZIMUTH, _ELEVATION, 0.0)
+        azimuth_slope = _slope(slope_right, slope_left, 2 * step_rad, range_m)
 
+        # Neighbours above and below may differ in azimuth: the change by the azimuth is subtracted.
         above = _first_filled(cells, row, column, up, beside)
         below = _first_filled(cells, row, column, down, beside)
-        slope_up = _slope_to(spherical, i, above, 1, 0, azimuth_slope)
-        slope_down = _slope_to(spherical, i, below, 1, 0, azimuth_slope)
-        elevation_slope = _slope(slope_up, slope_down, elevation_gap, spherical[2, i])
-        elevation_slope = 0.0 if np.isnan(elevation_slope) else elevation_slope
+        slope_up = _slope_to(spherical, i, above, _ELEVATION, _AZIMUTH, azimuth_slope)
+        slope_down = _slope_to(spherical, i, below, _ELEVATION, _AZIMUTH, azimuth_slope)
+        elevation_slope = _slope(slope_up, slope_down, elevation_gap, range_m)
         _put(i, spherical, table, azimuth_slope, elevation_slope, normal, spacing)
 
 
-@Kernel
-def _fit_unordered(first, last, rows, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
-    """Fill normal and spacing as `_fit_on_rings`, by a plane through all neighbours."""
+@inlined
+def _sum_products(i, spherical, cells, row, column, reach, slope_u, slope_v, is_refit, sums):  # type: ignore[no-untyped-def]
+    """Fill in ``sums`` (5,) of products, and return the numbers of all and of used neighbours."""
+    # u and v are angles to the left and upwards on the sphere, w is inverse range, all relative to
+    # point i. A refit uses only neighbours close to the plane w = slope_u · u + slope_v · v.
+    azimuth, elevation = spherical[_AZIMUTH, i], spherical[_ELEVATION, i]
+    range_m, shortening = spherical[_RANGE, i], np.cos(elevation)
     num_rows, num_columns = cells.shape
-    for k in range(first, last):
+    uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0
+    num_neighbours, num_fitted = 0, 0
+    for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
+        for c in range(column - reach, column + reach + 1):
+            j = cells[r, c % num_columns]  # columns wrap around
+            if j < 0:
+                continue
+            u = spherical[_AZIMUTH, j] - azimuth
+            u = (u - 2 * np.pi * np.rint(u / (2 * np.pi))) * shortening
+            v, w = spherical[_ELEVATION, j] - elevation, 1 / spherical[_RANGE, j] - 1 / range_m
+            if u == 0 and v == 0 and w == 0:
+                continue  # the point itself, or one at the same position
+            num_neighbours += 1
+            # A difference of inverse range (1/m), times range², is one of range (m).
+            deviation_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
+            if is_refit and deviation_m > AGREE_M + _BEND * abs(w) * range_m * range_m:
+                continue
+            num_fitted += 1
+            uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
+    sums[0], sums[1], sums[2], sums[3], sums[4] = uu, uv, vv, uw, vw
+    return num_neighbours, num_fitted
+
+
+@Kernel
+def _fit_unordered(begin, end, rows, spherical, table, grid, cells, normal, spacing):  # type: ignore[no-untyped-def]
+    """Fill normal (N,3) and spacing (N,2) of points by a plane through all neighbours."""
+    sums = np.empty(5)
+    for k in range(begin, end):
         i = rows[k]
-        range_m, shortening = spherical[2, i], np.cos(spherical[1, i])
-        row, column = _cell(spherical[0, i], spherical[1, i], grid)
-        spacing_rad = _spacing(spherical[0, i], spherical[1, i], table)[1]
-        reach = min(1 + int(_RADIUS * spacing_rad / grid.bin_rad), _MOST_CELLS)
-        # The plane w = slope_u · u + slope_v · v: u and v are angles to the left and upwards on the
-        # sphere, w is inverse range, all relative to point i. It is fitted by least squares to all
-        # neighbours, then to those close to the first plane.
+        azimuth, elevation = spherical[_AZIMUTH, i], spherical[_ELEVATION, i]
+        row, column = _cell(azimuth, elevation, grid)
+        _, elevation_gap = _spacing(azimuth, elevation, table)
+        reach = min(1 + int(_RADIUS * elevation_gap / grid.bin_rad), _MOST_CELLS)
+        # The plane is fitted by least squares to all neighbours, then to those close to that plane.
         slope_u, slope_v = 0.0, 0.0
         for attempt in range(2):
-            uu, uv, vv, uw, vw = 0.0, 0.0, 0.0, 0.0, 0.0  # sums of products
-            num_neighbours, num_fitted = 0, 0
-            for r in range(max(row - reach, 0), min(row + reach, num_rows - 1) + 1):
-                for c in range(column - reach, column + reach + 1):
-                    j = cells[r, c % num_columns]  # columns wrap around
-                    if j < 0:
-                        continue
-                    u = spherical[0, j] - spherical[0, i]
-                    u = (u - 2 * np.pi * np.rint(u / (2 * np.pi))) * shortening
-                    v, w = spherical[1, j] - spherical[1, i], 1 / spherical[2, j] - 1 / range_m
-                    if u == 0 and v == 0 and w == 0:
-                        continue  # the point itself, or one at the same position
-                    num_neighbours += 1
-                    # A difference of inverse range (1/m), times range², is one of range (m).
-                    deviation_m = abs(w - slope_u * u - slope_v * v) * range_m * range_m
-                    if attempt and deviation_m > AGREE_M + _BEND * abs(w) * range_m * range_m:
-                        continue
-                    num_fitted += 1
-                    uu, uv, vv, uw, vw = uu + u * u, uv + u * v, vv + v * v, uw + u * w, vw + v * w
+            num_neighbours, num_fitted = _sum_products(
+                i, spherical, cells, row, column, reach, slope_u, slope_v, attempt == 1, sums
+            )
+            uu, uv, vv, uw, vw = sums[0], sums[1], sums[2], sums[3], sums[4]
             ridge = _RIDGE * (uu + vv) + 1e-12  # not singular, even with one neighbour
             slope_u, slope_v = slopes(uu + ridge, uv, vv + ridge, uw, vw)
             if 2 * num_fitted < num_neighbours:  # no single plane: the patch faces the scanner
                 slope_u, slope_v = 0.0, 0.0
         # From the sphere to a slope per radian of azimuth, which is shorter there
-        _put(i, spherical, table, slope_u * shortening, slope_v, normal, spacing)
+        azimuth_slope = slope_u * np.cos(elevation)
+        _put(i, spherical, table, azimuth_slope, slope_v, normal, spacing)
 
 
 def is_occluded(points: PointsInImage, shape: tuple[int, ...]) -> Bool:
-    """Return (K,) True for points clearly behind the nearest patch in an image of shape (H,W)."""
+    """Return the mask (K,) of points clearly behind the nearest patch in an image of (H,W) px."""
     slack_px = _SLACK_M * points.focal_px / points.depth[:, None]
     # At least half a pixel, so that each patch covers a pixel
     half_px = np.maximum(FOOTPRINT * points.spacing_px + slack_px, 0.5)
@@ -332,16 +353,16 @@ def paint(uv, inverse, slope, half_px, canvas):  # type: ignore[no-untyped-def]
 
 
 def sorted_by_pixel(points: PointsInImage, rank: Int, shape: tuple[int, ...]) -> tuple[Int, Int]:
-    """Return ``start`` (H·W+1,) and ``order`` (K,): K points in an image of shape (H,W), by pixel.
+    """Return the order of K points by their pixel in an image of shape (H,W), then by rank.
 
-    Pixel p has the points ``order[start[p]:start[p + 1]]``, ascending by ``rank`` (K,). Of equal
-    ranks the nearer point is first.
+    Of equal ranks the nearer point is first. Returned are ``start`` (H·W+1,) and the indices
+    ``order`` (K,) of the points: pixel p has ``order[start[p]:start[p + 1]]``.
     """
     row, column = pixel_of(points.uv)
     start = np.empty(shape[0] * shape[1] + 1, np.int64)
     order = np.empty(len(rank), np.int64)
     pixel = row * shape[1] + column
-    _by_pixel(pixel, rank, points.depth, points.frame, points.uv, start, order)
+    _sort_by_pixel(pixel, rank, points.depth, points.frame, points.uv, start, order)
     return start, order
 
 
@@ -360,9 +381,9 @@ def _wins(a, b, rank, depth, frame, uv):  # type: ignore[no-untyped-def]
 
 
 @Kernel
-def _by_pixel(pixel, rank, depth, frame, uv, start, order):  # type: ignore[no-untyped-def]
-    """Fill start (num_pixels + 1,) and order (K,) of `sorted_by_pixel`; ``pixel`` (K,) is flat."""
-    # The number of points of pixel p is counted at p + 1: the sums then end before pixel p + 1.
+def _sort_by_pixel(pixel, rank, depth, frame, uv, start, order):  # type: ignore[no-untyped-def]
+    """Fill start (num_pixels + 1,) and order (K,) of `sorted_by_pixel` by flat pixels (K,)."""
+    # The points of pixel p are counted at p + 1, so the running sum is the start of each pixel.
     start[:] = 0
     for p in pixel:
         start[p + 1] += 1
@@ -392,11 +413,12 @@ def limit_inverse(inverse, start):  # type: ignore[no-untyped-def]
 
 @inlined
 def slopes(uu, uv, vv, uw, vw):  # type: ignore[no-untyped-def]
-    """Return both slopes of the plane w = slope_u · u + slope_v · v, from second moments.
+    """Return slope_u and slope_v of the plane w = slope_u · u + slope_v · v through points.
 
-    The moments are means or sums of products of offsets u and v and of w, all from their means.
+    The arguments are sums or means of the products of u, v and w, all relative to their means.
     """
-    determinant = uu * vv - uv * uv  # of the normal equations
+    # Normal equations: uu slope_u + uv slope_v = uw, uv slope_u + vv slope_v = vw
+    determinant = uu * vv - uv * uv
     return (vv * uw - uv * vw) / determinant, (uu * vw - uv * uw) / determinant
 
 
@@ -416,9 +438,10 @@ def add_moments(moments, weight, u, v, w):  # type: ignore[no-untyped-def]
 
 @inlined
 def plane(moments, ridge):  # type: ignore[no-untyped-def]
-    """Return inverse depth (1/m) at offset 0, and slopes, of the plane through `add_moments`' sums.
+    """Return the weighted least-squares plane through the pixels summed by `add_moments`.
 
-    ``ridge``, a variance (px²), keeps pixels on one line from tilting the plane across the line.
+    Returned are inverse depth (1/m) at offset 0 and slopes right and down (1/m per px). ``ridge``,
+    a variance (px²), keeps pixels on one line from tilting the plane across the line.
     """
     sum_weights = moments[0]
     u, v, w = moments[1] / sum_weights, moments[2] / sum_weights, moments[6] / sum_weights

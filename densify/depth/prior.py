@@ -37,17 +37,17 @@ _EMPTY = 2 * np.log(FAR_M)  # logarithm of a depth beyond all others
 
 
 def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth:
-    """Return the depth map with pixels of the prior where it has no measured or filled depth.
+    """Return the depth map with pixels of the prior where the map has no depth.
 
-    A pixel stays empty if the prior has no value, shows sky by the mask, or is beyond ``FAR_M`` or
-    at its far limit. Pixels on the blurred transition between two surfaces stay empty too. A prior
-    that does not fit is not used. Confidences are a ranking. A pixel of the prior has at most 0.2,
-    less where the prior is steep or deviates from known pixels nearby. All known pixels have more.
+    A pixel stays empty if the prior has no value, shows sky by the mask, or is beyond 120 m or at
+    the prior's far limit. Pixels on the blurred transition between two surfaces stay empty too. A
+    prior that does not fit is not used. Confidences are a ranking. A pixel of the prior has at most
+    0.2, less where the prior is steep or deviates from known pixels nearby. Known pixels have more.
 
     Args:
         depth_map: The map to complete.
         prior: Depth image of the user, of the map's shape and measure of depth.
-        kind: What the prior's values are: ``depth``, ``inverse`` (depth) or ``auto``.
+        kind: Meaning of the prior's values: ``depth``, ``inverse`` (depth) or ``auto``.
     """
     has_value = (prior.value > 0) & ~prior.sky
     has_depth = depth_map.filled_m > 0
@@ -72,12 +72,12 @@ def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth
     nearer = guide - cv2.erode(guide, _NEIGHBOURHOOD)
     steepness = farther + nearer
 
-    correction, spread = _correction(depth_map.filled_m, log_depth, guide, steepness, usable)
+    correction, remaining = _correction(depth_map.filled_m, log_depth, guide, steepness, usable)
     full_m = np.exp(np.minimum(log_depth + correction, _EMPTY)).astype(np.float32)
     # A pixel far from both surfaces is on the blurred transition between them.
     usable &= (np.minimum(farther, nearer) < 2 * _USUAL) & (full_m < FAR_M)
     from_prior = usable & (depth_map.filled_m == 0)
-    error = np.hypot(spread, steepness) / _USUAL
+    error = np.hypot(remaining, steepness) / _USUAL
     return FullDepth(
         np.where(from_prior, full_m, depth_map.filled_m),
         np.where(from_prior, _MOST_CONFIDENCE / (1 + error), confidence).astype(np.float32),
@@ -88,9 +88,10 @@ def complete(depth_map: DepthMap, prior: Prior, kind: str = "auto") -> FullDepth
 
 
 def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
-    """Return the curve from values (N,) of a prior to depths (N,) m with the least ``residual``.
+    """Return the curve with the least residual from values of a prior to depths.
 
-    Both are above 0. A curve that turns near into far is rejected. ``kind`` is as in `complete`.
+    Values (N,) and depths (N,) are above 0. A curve that turns near into far is rejected. ``kind``
+    is ``depth``, ``inverse`` (depth) or ``auto``.
     """
     p, z = value.astype(np.float64), depth_m.astype(np.float64)
     fits = [_fit_form(form, p, z) for form in _FORMS[kind]]
@@ -98,10 +99,11 @@ def fit_prior(value: Float32, depth_m: Float32, kind: str) -> PriorFit:
 
 
 def _fit_form(form: str, p: Float, z: Float) -> PriorFit:
-    """Fit one form of curve to values p (N,) and depths z (N,) by medians in steps of depth."""
+    """Return one form of curve fitted to values p (N,) and depths z (N,), m."""
     if len(z) < _MIN_FITTED:
         return PriorFit(form, 0.0, 0.0, np.inf, 1.0, False)
-    # Pixels of a step have about equal depth. Medians tolerate outliers among them.
+    # Pixels of a step have about equal depth. The curve goes through the medians of the steps,
+    # which tolerate outliers.
     step = np.floor(np.log(z / z.min()) / _USUAL).astype(np.int64)
     num_pixels = np.bincount(step)
     steps = np.flatnonzero(num_pixels)
@@ -111,7 +113,7 @@ def _fit_form(form: str, p: Float, z: Float) -> PriorFit:
 
     curve = PriorFit(form, scale, shift, np.inf, 1.0, False)
     deviation = np.abs(_log_depth(p, curve) - np.log(z))
-    # Together the pixels of a step weigh the root of their number: most pixels are near.
+    # Most pixels are near. The pixels of a step together therefore weigh the root of their number.
     weight = 1 / np.sqrt(num_pixels)[step]
     residual = float(np.average(np.minimum(deviation, _WRONG), weights=weight))
     wrong_share = float(np.average(deviation > _WRONG, weights=weight))
@@ -120,7 +122,8 @@ def _fit_form(form: str, p: Float, z: Float) -> PriorFit:
 
 
 def _fit_curve(form: str, p: Float, z: Float) -> tuple[float, float]:
-    """Return scale and shift of a curve of one form through values p and depths z, both (N,)."""
+    """Return scale and shift of one form of curve through values p (N,) and depths z (N,), m."""
+    # z = scale · p + shift, 1 / z = scale · p + shift, or log z = scale · log p + shift.
     # Values are divided by their median, so that both unknowns are of similar size.
     unit = float(np.median(p))
     ones = np.ones(len(z))
@@ -140,14 +143,14 @@ def _fit_curve(form: str, p: Float, z: Float) -> tuple[float, float]:
     start = np.linalg.lstsq(A, target, rcond=None)[0]
     solution = optimize.least_squares(residual, start, loss="soft_l1", f_scale=_USUAL)
     scale, shift = (float(number) for number in solution.x)
-    # Back to values that are not divided by the unit
+    # Scale and shift for values that are not divided by their median
     if form == "log":
         return scale, shift - scale * np.log(unit)
     return scale / unit, shift
 
 
 def _log_depth(value: Float | Float32, fit: PriorFit) -> Float:
-    """Return the logarithm of depth in metres by the curve, whose values are kept above 0."""
+    """Return the logarithm of depth in metres by the curve. Depths are kept above 0."""
     value = value.astype(np.float64)
     if fit.kind == "log":
         return fit.scale * np.log(np.maximum(value, np.finfo(np.float64).tiny)) + fit.shift
@@ -166,7 +169,7 @@ class _Cells(NamedTuple):
     def over(guide: Float32) -> _Cells:
         """Return up to 40,000 cells that cover the image ``guide`` (H,W), logarithm of depth."""
         size = max(1, int(np.ceil(np.sqrt(guide.size / _MAX_CELLS))))
-        rows, columns = (
+        rows, columns = (  # of the central pixels of the cells
             np.minimum(np.arange(0, length, size) + size // 2, length - 1) for length in guide.shape
         )
         row, column = (np.arange(length) // size for length in guide.shape)
@@ -174,18 +177,18 @@ class _Cells(NamedTuple):
         return _Cells(size, guide[np.ix_(rows, columns)].astype(np.float64), number)
 
     def membrane(self) -> sparse.csr_array:
-        """Return the (RC,RC) matrix of the squared differences between neighbouring cells."""
+        """Return the matrix L (RC,RC): x' L x sums squared differences between neighbours in x."""
         cell = np.arange(self.guide.size).reshape(self.guide.shape)
-        first = np.concatenate([cell[:, :-1].ravel(), cell[:-1].ravel()])
-        second = np.concatenate([cell[:, 1:].ravel(), cell[1:].ravel()])
-        step = (self.guide.ravel()[first] - self.guide.ravel()[second]) / _USUAL
+        cell_a = np.concatenate([cell[:, :-1].ravel(), cell[:-1].ravel()])
+        cell_b = np.concatenate([cell[:, 1:].ravel(), cell[1:].ravel()])  # right of a, or below
+        step = (self.guide.ravel()[cell_a] - self.guide.ravel()[cell_b]) / _USUAL
         tie = _SMOOTHNESS * np.exp(-(step**2))  # less, the more the guides of both cells differ
-        half = sparse.coo_array((tie, (first, second)), shape=(cell.size, cell.size))
+        half = sparse.coo_array((tie, (cell_a, cell_b)), shape=(cell.size, cell.size))
         weights = (half + half.T).tocsr()
         return sparse.diags_array(weights.sum(axis=1)) - weights
 
     def at_pixels(self, values: Float, guide: Float32) -> Float:
-        """Return (K,H,W) the cells' values (K,RC) between four cells, by log depth ``guide``."""
+        """Return the cells' values (K,RC) at pixels (K,H,W), interpolated between four cells."""
         grid = values.reshape(-1, *self.guide.shape)
         # Positions of the image's rows and columns, in cells from the centre of the first
         down, right = ((np.arange(length) - self.size // 2) / self.size for length in guide.shape)
@@ -203,7 +206,7 @@ class _Cells(NamedTuple):
 
 
 def _cells_beside(position: Float, num_cells: int) -> list[tuple[Int, Float]]:
-    """Return the cells before and after fractional positions, each with its weights."""
+    """Return the cells before fractional positions and those after, each with their weights."""
     before = np.clip(np.floor(position), 0, num_cells - 1).astype(np.int64)
     after = np.minimum(before + 1, num_cells - 1)
     share = np.clip(position - before, 0, 1)
@@ -213,10 +216,10 @@ def _cells_beside(position: Float, num_cells: int) -> list[tuple[Int, Float]]:
 def _correction(
     filled_m: Float32, log_depth: Float, guide: Float32, steepness: Float32, usable: Bool
 ) -> tuple[Float, Float]:
-    """Return (H,W) the correction of the prior's log depth, and (H,W) its remaining error."""
+    """Return the correction (H,W) of the prior's log depth, and the remaining error (H,W)."""
     cells = _Cells.over(guide)
     area, num_cells = cells.size**2, cells.guide.size
-    # Known pixels pull their cell, unless they are on another surface than its centre.
+    # Known pixels pull their cell, unless they are on another surface than the cell's centre.
     centre_guide = cells.guide.ravel()[cells.number]
     pulls = usable & (filled_m > 0) & (np.abs(guide - centre_guide) < _USUAL)
     cell = cells.number[pulls]
@@ -224,7 +227,7 @@ def _correction(
     membrane = cells.membrane()
 
     def solve_membrane(weight: Float, values: Float, elsewhere: float) -> Float:
-        """Return the (RC,) membrane pulled to values (N,), and to ``elsewhere`` far from them."""
+        """Return the (RC,) membrane pulled to N values, and to ``elsewhere`` far from them."""
         diagonal = np.bincount(cell, weight, num_cells) / area + _TOWARDS_NONE
         pull = np.bincount(cell, weight * values, num_cells) / area + _TOWARDS_NONE * elsewhere
         system = (membrane + sparse.diags_array(diagonal)).tocsc()
@@ -234,15 +237,15 @@ def _correction(
     flatness_weight = _robust_weight(steepness[pulls])
     mean_error = np.average(np.abs(deviation), weights=flatness_weight) if len(deviation) else 0.0
     # Pixels that deviate from a first solution are outliers.
-    first = solve_membrane(flatness_weight, deviation, 0.0)
-    weight = flatness_weight * _robust_weight(deviation - first[cell])
+    draft = solve_membrane(flatness_weight, deviation, 0.0)
+    weight = flatness_weight * _robust_weight(deviation - draft[cell])
     correction = solve_membrane(weight, deviation, 0.0)
-    # The mean error of known pixels nearby on the same surface; far from them, of the image.
-    spread = solve_membrane(weight, np.abs(deviation - correction[cell]), mean_error)
-    correction, spread = cells.at_pixels(np.stack([correction, spread]), guide)
-    return correction, spread
+    # The mean error of known pixels nearby on the same surface, far from them of the whole image
+    remaining = solve_membrane(weight, np.abs(deviation - correction[cell]), mean_error)
+    correction, remaining = cells.at_pixels(np.stack([correction, remaining]), guide)
+    return correction, remaining
 
 
 def _robust_weight(deviation: Float | Float32) -> Float:
-    """Return the (N,) weights of pixels with these deviations in the logarithm of depth."""
+    """Return the weights (N,) of pixels by their deviations (N,) in the logarithm of depth."""
     return 1 / (1 + (deviation.astype(np.float64) / (2 * _USUAL)) ** 2)

@@ -45,7 +45,7 @@ def project(inputs: MapInputs) -> DepthMap:
         _rate(record, cloud, view.exposure.camera)
     else:
         _rate_by_age(record, cloud)
-    # Points in the map, and points removed from it
+    # Points in the map, and points removed from the map
     record.reason[record.point[record.boundary_m > 0]] = Reason.EDGE
     record.reason[record.point[record.depth_m > 0]] = Reason.KEPT
     if filled and visible:
@@ -102,11 +102,11 @@ def _finished(record: MapRecord, inputs: MapInputs) -> DepthMap:
 def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Rays) -> None:
     """Reject the pixels of a record, in place, that rays passed through.
 
-    A ray passed through if its point is static and occluded (`Reason.HIDDEN`). It counts in the
-    pixel where it crosses the surface of the map, clearly before its end. A ray stopped if its
-    point has any other reason. It counts in the pixel of its point. Both counts are blurred by a
-    third of the ray spacing. A pixel is rejected if more than a quarter of its rays passed through.
-    Moving bodies stay. Points of sweeps outside the window do not count.
+    A ray passed through if its point is static and occluded (`Reason.HIDDEN`). The ray counts in
+    the pixel where it crosses the surface of the map, clearly before its end. A ray stopped if its
+    point has any other reason. The ray counts in the pixel of its point. Both counts are blurred by
+    a third of the ray spacing. A pixel is rejected if more than a quarter of its rays passed
+    through. Moving bodies stay. Points of sweeps outside the window do not count.
     """
     in_window = np.isin(cloud.frame, rays.stretch.frames)
     counted = in_window & (record.reason != Reason.OUTSIDE)
@@ -125,7 +125,7 @@ def reject_seen_through(record: MapRecord, cloud: Cloud, view: InView, rays: Ray
 
 
 def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
-    """Return (H,W) the number of positions uv (K,2) in each pixel, blurred by ``blur_px``."""
+    """Return the (H,W) number of positions uv (K,2) in each pixel, blurred by ``blur_px``."""
     row, column = pixel_of(uv)
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1])
     pixels = counts.reshape(shape).astype(np.float32)
@@ -136,10 +136,10 @@ def _counts(uv: Float, shape: tuple[int, ...], blur_px: float) -> Float32:
 
 
 def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure: Exposure) -> Float:
-    """Return the (P,2) px where rays cross the surface of a map clearly before they end.
+    """Return the pixel coordinates where rays cross the surface of a map clearly before they end.
 
-    The search starts at the end of the ray. It goes to the point of the ray at the surface's depth
-    in the present pixel, and repeats this until the depth stays the same.
+    The search starts at the end of the ray. A step goes to the point of the ray at the surface's
+    depth in the present pixel. Steps repeat until the depth stays the same. Returned are (P,2) px.
 
     Args:
         surface_m: (H,W) depth of the surface in metres, 0 for none.
@@ -161,7 +161,7 @@ def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure:
         with np.errstate(invalid="ignore"):
             is_same = abs(depth_m - last_depth_m) <= agree_m(last_depth_m)
 
-        # On to the point of the ray at this depth; a ray that does not reach it is dropped.
+        # On to the point of the ray at this depth. A ray that does not reach the depth is dropped.
         share = _share_at_depth(start_cam, end_cam, depth_m, exposure.measure)
         is_valid &= (depth_m > 0) & (share > 0) & (share < 1)
         share = np.where(is_valid, share, 1.0)[:, None]
@@ -173,17 +173,19 @@ def find_crossings(surface_m: Float32, from_key: Float, to_key: Float, exposure:
 
 
 def _share_at_depth(start: Float, end: Float, depth_m: Float, measure: str) -> Float:
-    """Return the (P,) share of the way from start to end (P,3), camera frame, at these depths.
+    """Return the (K,) shares of the ways from start to end (K,3), camera frame, at given depths.
 
-    It is not finite, or not between 0 and 1, if the way does not reach the depth.
+    A share is not finite, or not between 0 and 1, if the way does not reach the depth. ``measure``
+    is ``z`` or ``range``.
     """
     path = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
         if measure == "z":
             return (depth_m - start[:, 2]) / path[:, 2]
-        # The farther solution of |start + share · path|² = depth²
+        # The farther solution of |start + share · path|² = depth², that is
+        # share² path² + 2 share start · path + start² - depth² = 0
         length_squared = (path**2).sum(axis=1)
         start_along_path = (start * path).sum(axis=1)
-        range_difference = (start**2).sum(axis=1) - depth_m**2
-        discriminant = start_along_path**2 - length_squared * range_difference
+        difference_of_squares = (start**2).sum(axis=1) - depth_m**2
+        discriminant = start_along_path**2 - length_squared * difference_of_squares
         return (np.sqrt(discriminant) - start_along_path) / length_squared

@@ -47,7 +47,7 @@ class Rays:
     key: int  # frame number of the key sweep
 
     def origins_of(self, cloud: Cloud) -> Float:
-        """Return the (M,3) origins at firing time of M points' rays, key sweep's lidar frame."""
+        """Return the origins (M,3) of M points' rays at firing time, key sweep's lidar frame."""
         origins = np.empty((len(cloud), 3))
         for frame in np.unique(cloud.frame).tolist():
             rows = np.flatnonzero(cloud.frame == frame)
@@ -65,7 +65,7 @@ class Rays:
         return origins
 
     def origin_bound_m(self, frame: int) -> float:
-        """Return a bound of the distances of a sweep's ray origins from its lidar in metres."""
+        """Return the greatest possible distance (m) of a sweep's ray origins from its lidar."""
         registered = self.stretch[frame]
         sweep = registered.sweep
         bound_m = float(np.linalg.norm(_scanner_origins(sweep), axis=1).max())
@@ -83,15 +83,15 @@ def _scanner_origins(sweep: Sweep) -> Float:
 
 
 def half_spaces(corners: Float) -> Float:
-    """Return the (F,4) sides n, d of the corners' (V,3) convex hull, inside if n · x + d ≤ 0."""
+    """Return the sides (F,4) n, d of the corners' (V,3) convex hull: inside is n · x + d ≤ 0."""
     return np.unique(ConvexHull(corners).equations, axis=0)  # one for all triangles of a side
 
 
 def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float, Float]:
-    """Return the (K,) t at which lines start + t · direction enter a convex body, and leave it.
+    """Return where lines, start + t · direction, enter a convex body and where they leave the body.
 
-    A line that misses the body leaves before it enters. The body has the sides (F,4) of
-    `half_spaces`. The lines start at (K,3), or all at (3,); their directions (K,3) have any length.
+    The body has the sides (F,4) of `half_spaces`. Lines start at (K,3), or all at (3,). Directions
+    (K,3) have any length. Returned are t (K,) of entering and of leaving, less if a line misses.
     """
     enter, leave = np.full(len(direction), -np.inf), np.full(len(direction), np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -100,8 +100,8 @@ def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float,
             # to a side and outside it would enter.
             slope = direction @ side[:3] + 0.0
             t = (start @ -side[:3] - side[3]) / slope
-            # The line enters where it has passed all sides inwards, and leaves at the first
-            # outwards.
+            # A line enters where all sides have been passed inwards. It leaves at the first side
+            # that is passed outwards.
             is_inward = slope < 0
             np.maximum(enter, np.where(is_inward, t, -np.inf), out=enter)
             np.fmin(leave, np.where(is_inward, np.inf, t), out=leave)
@@ -109,7 +109,7 @@ def find_crossing(spaces: Float, start: Float, direction: Float) -> tuple[Float,
 
 
 def passes_near(corners: Float, start: Float, direction: Float) -> Bool:
-    """Return (K,) True for lines as in `find_crossing` that meet a sphere around corners (V,3)."""
+    """Return the mask (K,) of lines (start, direction) that meet a sphere around corners (V,3)."""
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     radius_m = np.linalg.norm(corners - middle, axis=1).max()
     # The distance of a line from the middle, times the length of its direction
@@ -130,48 +130,56 @@ def rays_toward(
 ) -> dict[int, ObjectRays]:
     """Return the rays of all sweeps that may meet the hull of each object, by instance number.
 
-    Only sweeps with points of the object count: they tell its motion.
+    Only sweeps with points of the object count, because these points tell the object's motion.
 
     Args:
         cloud: The cloud that the rays measured.
         rays: The rays of the window's sweeps.
-        rows_of: Indices of each object's points in the cloud.
-        corners: (V,3) corners of each object's hull at the key's time, key sweep's lidar frame.
+        rows_of: Indices of each object's points in the cloud, by instance number.
+        corners: (V,3) hull corners of each object at the key's time, key sweep's lidar frame.
     """
-    by_sweep: dict[int, list[ObjectRays]] = {instance: [] for instance in rows_of}
-    for frame in rays.stretch.frames if rows_of else ():
-        # The returns of the sweep, by their direction from the lidar
-        returns = np.flatnonzero(cloud.frame == frame)
-        lidar_origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
-        from_lidar = cloud.rigid_points.take(returns, axis=0) - lidar_origin
-        xy = from_lidar[:, :2].T.astype(np.float32)
-        bound_m = rays.origin_bound_m(frame)
-
-        # Motion of each object from the sweep's to the key's time, and the returns toward it
-        toward = dict[int, tuple[Float, Int]]()
-        for instance, rows in rows_of.items():
-            own = rows[cloud.frame[rows] == frame]
-            if len(own):
-                T_key_sweep = poses.fit_rigid(cloud.rigid_points[own], cloud.points[own])
-                hull = poses.transform(poses.inverse(T_key_sweep), corners[instance])
-                is_toward = _may_meet(xy, bound_m, hull - lidar_origin)
-                toward[instance] = T_key_sweep, returns[is_toward]
-
-        # All origins are found together, and cut into those of each object.
-        all_returns = np.concatenate([returns[:0], *(rows for _, rows in toward.values())])
-        origins = rays.origins_of(cloud.select(all_returns))
-        for instance, (T_key_sweep, rows) in toward.items():
-            start = poses.transform(T_key_sweep, origins[: len(rows)])
+    if not rows_of:
+        return {}
+    parts_of: dict[int, list[ObjectRays]] = {instance: [] for instance in rows_of}
+    for frame in rays.stretch.frames:
+        toward = _returns_toward(cloud, rays, frame, rows_of, corners)
+        if not toward:
+            continue
+        # All origins are found together, and split into those of each object.
+        rows_of_part = [rows for _, rows in toward.values()]
+        origins = rays.origins_of(cloud.select(np.concatenate(rows_of_part)))
+        parts = np.split(origins, np.cumsum([len(rows) for rows in rows_of_part])[:-1])
+        for (instance, (T_key_sweep, rows)), part in zip(toward.items(), parts, strict=True):
+            start = poses.transform(T_key_sweep, part)
             end = poses.transform(T_key_sweep, cloud.rigid_points[rows])
-            by_sweep[instance].append(ObjectRays(rows, start, end - start))
-            origins = origins[len(rows) :]
-    return {instance: joined_rows(parts) for instance, parts in by_sweep.items()}
+            parts_of[instance].append(ObjectRays(rows, start, end - start))
+    return {instance: joined_rows(parts) for instance, parts in parts_of.items()}
+
+
+def _returns_toward(
+    cloud: Cloud, rays: Rays, frame: int, rows_of: Mapping[int, Int], corners: Mapping[int, Float]
+) -> dict[int, tuple[Float, Int]]:
+    """Return, by instance number, an object's motion since a sweep, and the returns toward it."""
+    returns = np.flatnonzero(cloud.frame == frame)
+    lidar_origin = rays.stretch.T_target_source(rays.key, frame)[:3, 3]
+    from_lidar = cloud.rigid_points.take(returns, axis=0) - lidar_origin
+    xy = from_lidar[:, :2].T.astype(np.float32)
+    bound_m = rays.origin_bound_m(frame)
+    toward = dict[int, tuple[Float, Int]]()
+    for instance, rows in rows_of.items():
+        own = rows[cloud.frame[rows] == frame]
+        if len(own):
+            T_key_sweep = poses.fit_rigid(cloud.rigid_points[own], cloud.points[own])
+            hull = poses.transform(poses.inverse(T_key_sweep), corners[instance])
+            is_toward = _may_meet(xy, bound_m, hull - lidar_origin)
+            toward[instance] = T_key_sweep, returns[is_toward]
+    return toward
 
 
 def _may_meet(xy: Float32, bound_m: float, corners: Float) -> Bool:
-    """Return (N,) True for returns at xy (2,N) m whose rays may meet a hull with corners (V,3).
+    """Return the mask (N,) of returns at xy (2,N) m whose rays may meet a hull of corners (V,3).
 
-    Both are relative to the lidar. Rays start at most ``bound_m`` from it.
+    Returns and corners are relative to the lidar. Rays start at most ``bound_m`` from the lidar.
     """
     x, y, _ = corners.T
     middle = np.array([x.mean(), y.mean()])
@@ -203,7 +211,7 @@ def find_moving_bodies(
 ) -> dict[int, MovingBody]:
     """Return the bodies of moving objects, by instance number.
 
-    An object has a body if its points span a volume and one of the ``exposures`` shows it.
+    An object has a body if its points span a volume and one of the ``exposures`` shows a corner.
     """
     moving = np.flatnonzero(cloud.moving & (cloud.instance >= 0))
     instance_of = cloud.instance[moving]
@@ -236,7 +244,7 @@ def find_moving_bodies(
 def without_sweep(
     bodies: Mapping[int, MovingBody], cloud: Cloud, frame: int
 ) -> dict[int, MovingBody]:
-    """Return the bodies that span a volume in a ``cloud`` without this sweep, without its rays."""
+    """Return the bodies without the rays of a sweep, if a ``cloud`` without it spans a volume."""
     reduced_bodies = {}
     for instance, body in bodies.items():
         corners = _hull_corners(cloud.points[cloud.moving & (cloud.instance == instance)])
@@ -247,8 +255,8 @@ def without_sweep(
 
 
 def _hull_corners(points: Float) -> Float:
-    """Return the (V,3) hull corners of points (N,3) with others around, none without a volume."""
-    # One more point than needed: the nearest is the point itself.
+    """Return the (V,3) hull corners of points (N,3) without outliers, none without a volume."""
+    # One more point than needed, because the nearest is the point itself.
     distance_m, _ = KDTree(points).query(points, [_LEAST_NEAR + 1])
     points = points[np.ravel(distance_m) <= _NEAR_M]
     try:
@@ -260,19 +268,19 @@ def _hull_corners(points: Float) -> Float:
 def complete_boxes(
     tracks: Sequence[ObjectTrack], cloud: Cloud, rays: Rays, ground: HeightMap
 ) -> tuple[ObjectTrack, ...]:
-    """Return the tracks with completed boxes, and in ``sides_seen`` the sides that were seen.
+    """Return the tracks with completed boxes and the names of the sides that were seen.
 
-    Where no ray shows free space a box grows to the usual size of a vehicle, and to the ground. A
-    side is seen if free space begins within 0.4 m of it. The bottom is never named. ``ground`` is
-    in the world frame of the sweeps.
+    Where no ray shows free space, a box grows to the usual size of a vehicle, and to the ground. A
+    side is seen if free space begins within 0.4 m of the side. The bottom is never named. The
+    ``ground`` is in the world frame of the sweeps.
     """
     tracks = [_lower_to_ground(track, rays, ground) for track in tracks]
     reach, rows_of = dict[int, Float](), dict[int, Int]()
     for track in tracks:
         # The space into which the box may grow, at both ends of each axis
-        reach_m = track.size_m + 2 * (_missing_m(track.size_m) + _BESIDE_M)
+        reach_size_m = track.size_m + 2 * (_missing_m(track.size_m) + _BESIDE_M)
         T_key_object = track.T_key_object[track.frames.index(rays.key)]
-        reach[track.instance] = poses.transform(T_key_object, corners_of(reach_m))
+        reach[track.instance] = poses.transform(T_key_object, corners_of(reach_size_m))
         is_own = cloud.moving & (cloud.instance == track.instance)
         rows_of[track.instance] = np.flatnonzero(is_own)
     toward = rays_toward(cloud, rays, rows_of, reach)
@@ -280,7 +288,7 @@ def complete_boxes(
 
 
 def _missing_m(size_m: Float) -> Float:
-    """Return the (3,) metres that a box lacks to a usual vehicle: length, width, height (0)."""
+    """Return the (3,) length, width and height (0) in metres that a box lacks to a vehicle."""
     length_m, width_m, _ = size_m
     missing_m = np.zeros(3)
     if length_m >= _CAR_LENGTH_M:
@@ -301,47 +309,53 @@ def _lower_to_ground(track: ObjectTrack, rays: Rays, ground: HeightMap) -> Objec
 
 
 def corners_of(size_m: Float) -> Float:
-    """Return the (8,3) corners, bottom and top in turn, of a box of (3,) m around the origin."""
+    """Return the corners (8,3), bottom and top in turn, of a box of (3,) m around the origin."""
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1)
     return signs.reshape(-1, 3) * size_m / 2
 
 
 def _complete_box(track: ObjectTrack, rays: ObjectRays, key: int) -> ObjectTrack:
     """Return a track with its completed box, from the rays toward the object."""
-    # Rays that cross the space into which the box may grow, between origin (0) and return (1)
-    T_object_key = poses.inverse(track.T_key_object[track.frames.index(key)])
-    start = poses.transform(T_object_key, rays.start)
-    to_return = poses.rotate(T_object_key, rays.to_return)
     missing_m = _missing_m(track.size_m)
-    reach_m = track.size_m / 2 + missing_m + _BESIDE_M
-    enter, leave = find_crossing(_box_spaces(-reach_m, reach_m), start, to_return)
-    crosses = (enter < leave) & (leave > 0) & (enter < 1)
-    start, to_return = start[crosses], to_return[crosses]
-
+    T_object_key = poses.inverse(track.T_key_object[track.frames.index(key)])
+    start, to_return = _rays_in_reach(rays, T_object_key, track.size_m / 2 + missing_m)
     completed = track
     sides_seen = list[str]()
     for axis, sides in enumerate(_SIDES):
         # At the lower and at the upper end of the axis. The rays are in the frame of the first box.
-        free_m = [
+        distances_m = [
             _distance_to_free_space_m(track.size_m, missing_m, axis, sign, start, to_return)
             for sign in (-1, 1)
         ]
-        # A seen side stays where it is. Free space limits the growth of the other.
-        room_m = [end_m if end_m > _BESIDE_M else 0.0 for end_m in free_m]
-        sides_seen += [side for side, end_m in zip(sides, room_m, strict=True) if not end_m]
-        if missing_m[axis] > 0 and sum(room_m):
-            growth_m = _share_growth(float(missing_m[axis]), room_m)
-            completed = grow_box(completed, axis, *growth_m)
+        # Free space within 0.4 m fixes a side: it is seen. Farther free space limits its growth.
+        limits_m = [distance_m if distance_m > _BESIDE_M else 0.0 for distance_m in distances_m]
+        sides_seen += [side for side, limit_m in zip(sides, limits_m, strict=True) if not limit_m]
+        if missing_m[axis] > 0 and sum(limits_m):
+            before_m, after_m = _share_growth(float(missing_m[axis]), limits_m)
+            completed = grow_box(completed, axis, before_m, after_m)
     return replace(completed, sides_seen=tuple(side for side in sides_seen if side != "bottom"))
 
 
-def _share_growth(missing_m: float, room_m: Sequence[float]) -> list[float]:
-    """Return the growth of the two ends of a box in metres, within the room at each end."""
-    # Equal parts, if there is room at both ends. An end takes what the other has no room for.
-    num_ends = 1 + all(room_m)
-    part_m = [min(end_m, missing_m / num_ends) for end_m in room_m]
-    rest_m = missing_m - sum(part_m)
-    return [min(end_m, part + rest_m) for end_m, part in zip(room_m, part_m, strict=True)]
+def _rays_in_reach(rays: ObjectRays, T_object_key: Float, half_m: Float) -> tuple[Float, Float]:
+    """Return start and vector to the return (K,3), object frame, of rays that cross the reach."""
+    # The reach is the space into which the box may grow, with the margin of free space around.
+    start = poses.transform(T_object_key, rays.start)
+    to_return = poses.rotate(T_object_key, rays.to_return)
+    reach_m = half_m + _BESIDE_M
+    enter, leave = find_crossing(_box_spaces(-reach_m, reach_m), start, to_return)
+    crosses = (enter < leave) & (leave > 0) & (enter < 1)  # 0 is the origin, 1 the return
+    return start[crosses], to_return[crosses]
+
+
+def _share_growth(missing_m: float, limits_m: Sequence[float]) -> list[float]:
+    """Return the growth of the two ends of a box in metres, within the limit of each end."""
+    # Equal parts, if both ends may grow. An end takes what the limit of the other leaves.
+    num_ends = 1 + all(limits_m)
+    parts_m = [min(limit_m, missing_m / num_ends) for limit_m in limits_m]
+    more_m = missing_m - sum(parts_m)
+    return [
+        min(limit_m, part_m + more_m) for limit_m, part_m in zip(limits_m, parts_m, strict=True)
+    ]
 
 
 def _distance_to_free_space_m(
@@ -350,10 +364,10 @@ def _distance_to_free_space_m(
     """Return the metres from a side of a box to the nearest free space outside; inf for none.
 
     The side is at the lower (``sign`` -1) or upper (1) end of ``axis``. Free space is where three
-    rays (K,3), in the frame of the box, pass. It is looked for up to where the box may grow.
+    rays (K,3), in the frame of the box, pass. The search ends 0.4 m beyond the greatest growth.
     """
-    # The searched space, from low to high: from the side outwards, and beside its flat part only;
-    # vertical sides are tested below the windows.
+    # The searched space, from low to high, is outside the flat part of the side. At vertical sides
+    # the space is below the windows, because rays pass through glass.
     low, high = -_MIDDLE * size_m / 2, _MIDDLE * size_m / 2
     if axis < 2:
         low[2], high[2] = -size_m[2] / 2 + np.array(_BODY) * size_m[2]
@@ -378,9 +392,9 @@ def _box_spaces(low: Float, high: Float) -> Float:
 
 
 def grow_box(track: ObjectTrack, axis: int, before_m: float, after_m: float) -> ObjectTrack:
-    """Return the track, its box longer along an axis (0, 1 or 2) of the object's frame.
+    """Return the track with a box that is longer along an axis (0, 1 or 2) of the object's frame.
 
-    It grows by ``before_m`` at the lower and ``after_m`` at the upper end of the axis.
+    The box grows by ``before_m`` at the lower and by ``after_m`` at the upper end of the axis.
     """
     size_m, T_key_object = track.size_m.copy(), track.T_key_object.copy()
     size_m[axis] += before_m + after_m

@@ -93,10 +93,10 @@ class Views:
         images: Mapping[str, NDArray[np.uint8]],
         settings: Config,
     ) -> Views:
-        """Return the cameras and times of the maps of the key sweep, a frame of the window.
+        """Return the cameras and times of the depth maps of a key sweep.
 
-        Shots and (H,W,3) RGB images are by name of the map. Images are used unless
-        ``project.rims`` is ``strict`` or they are misaligned (`is_off`).
+        Shots and RGB images (H,W,3) are by name of the map. Images are used unless ``project.rims``
+        is ``strict`` or their edges miss the depth discontinuities. ``key`` is a frame number.
         """
         sensors = Sensors.of(stretch.sweeps)
         exposures = {
@@ -124,7 +124,7 @@ class Views:
         )
 
     def see(self, cloud: Cloud) -> SeenCloud:
-        """Return a cloud with its patches, as the cameras see it."""
+        """Return a cloud with its patches and with its points in each image."""
         in_view = self.points_in_view(cloud)
         wanted = np.zeros(len(cloud), bool)
         for view in in_view.values():
@@ -132,7 +132,7 @@ class Views:
         return SeenCloud(cloud, find_patches(cloud, self.sensors, self.origins, wanted), in_view)
 
     def points_in_view(self, cloud: Cloud) -> dict[str, InView]:
-        """Return the points of a cloud in each image, by name of the map."""
+        """Return the points of a cloud that lie in each image, by name of the map."""
         return {name: exposure.view_of(cloud) for name, exposure in self.exposures.items()}
 
     def find_bodies(self, cloud: Cloud) -> dict[int, MovingBody]:
@@ -142,16 +142,16 @@ class Views:
     def see_far(
         self, world: StaticWorld, T_key_world: Float, stretch: Stretch, static_only: bool
     ) -> SeenCloud:
-        """Return the points of sweeps beyond the window as cameras see them; see `far_cloud`."""
-        cloud, surface = far_cloud(
-            world, T_key_world, stretch, self.key, self.exposures, static_only
+        """Return the static points beyond the window that cameras observe, in the key frame."""
+        cloud, patches = far_cloud(
+            world, T_key_world, stretch, self.key, self.exposures, static_only=static_only
         )
-        return SeenCloud(cloud, surface, self.points_in_view(cloud))
+        return SeenCloud(cloud, patches, self.points_in_view(cloud))
 
     def depth_maps(
         self, seen: SeenCloud, visible: bool = True, filled: bool = True
     ) -> dict[str, DepthMap]:
-        """Return each view's depth map, by name.
+        """Return the depth map of each view, by name of the map.
 
         Unless ``visible``, pixels take their nearest point, without occlusion or rejection. Unless
         ``filled``, pixels without a return stay empty.
@@ -180,7 +180,7 @@ class Views:
         depth_maps: Mapping[str, DepthMap],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> Cloud:
-        """Return the cloud with the colours of the (H,W,3) RGB images that observe its points.
+        """Return the cloud with the colours of the RGB images (H,W,3) that observe its points.
 
         A point is observed unless it is clearly behind the depth of its pixel. Pixels without
         depth give no colour. Maps and images are by name of the map.
@@ -190,9 +190,9 @@ class Views:
             view = seen.in_view[name]
             pixel = pixel_of(view.uv)
             surface_m = depth_maps[name].filled_m[pixel]
-            reach_m = surface_m + hidden_m(surface_m)
-            is_shown = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= reach_m)
-            rgb[view.rows[is_shown]] = image[pixel][is_shown]
+            limit_m = surface_m + hidden_m(surface_m)
+            is_observed = (surface_m > 0) & (view.exposure.depth_m(view.points_cam) <= limit_m)
+            rgb[view.rows[is_observed]] = image[pixel][is_observed]
         return replace(seen.cloud, rgb=rgb)
 
     def with_confidence(
@@ -215,7 +215,7 @@ class Views:
         return replace(cloud, confidence=confidence)
 
     def true_maps(self, truth: Truth) -> dict[str, tuple[Float32, Bool]]:
-        """Return the true depth (H,W) and moving pixels (H,W) of each map that shows an image."""
+        """Return the true depth (H,W), m, and moving pixels (H,W) of maps that show an image."""
         true_maps = {}
         for name, exposure in self.exposures.items():
             if exposure.number is not None:
@@ -226,7 +226,7 @@ class Views:
         return true_maps
 
     def cameras(self) -> dict[str, CameraView]:
-        """Return the viewpoint of each map by name."""
+        """Return the camera, pose and time of each map, by name of the map."""
         return {
             name: CameraView(exposure.camera, exposure.T_cam_key, exposure.late_s, exposure.number)
             for name, exposure in self.exposures.items()
@@ -235,7 +235,7 @@ class Views:
     def optical_flow(
         self, cloud: Cloud, depth_maps: Mapping[str, DepthMap]
     ) -> dict[str, dict[str, Float32]]:
-        """Return name of the map -> "previous" or "next" -> (H,W,2) `optical_flow` in px."""
+        """Return the optical flow (H,W,2) in px, by name of the map and "previous" or "next"."""
         return {
             name: {
                 image: optical_flow(cloud, depth_maps[name], exposure, neighbour)
@@ -247,7 +247,7 @@ class Views:
     def rejection_reasons(
         self, seen: SeenCloud, depth_maps: Mapping[str, DepthMap]
     ) -> dict[str, NDArray[np.uint8]]:
-        """Return by map (H,W) the `Reason` of each pixel's nearest rejected point, 0 for none."""
+        """Return the `Reason` (H,W) of each pixel's nearest rejected point, 0 for none, by map."""
         reason_maps = {}
         for name, view in seen.in_view.items():
             reason = depth_maps[name].reason[view.rows]
@@ -268,10 +268,10 @@ class Views:
         bodies: Mapping[int, MovingBody],
         images: Mapping[str, NDArray[np.uint8]],
     ) -> dict[int, Mover]:
-        """Return every moving object alone, by instance number.
+        """Return the points and depth maps of each moving object alone, by instance number.
 
         Moving points without an object are together, with the number -1. Without ``visible``,
-        occluded and unsupported points count too. Images are (H,W,3) RGB, by name of the map.
+        occluded and unsupported points count too. Images are RGB (H,W,3), by name of the map.
         """
         movers = {}
         for instance in np.unique(cloud.instance[cloud.moving]).tolist():
@@ -304,11 +304,11 @@ def _misaligned_maps(
 def optical_flow(
     cloud: Cloud, depth_map: DepthMap, exposure: Exposure, target: Exposure
 ) -> Float32:
-    """Return the (H,W,2) flow in pixels, right and down, between two exposures; NaN if unknown.
+    """Return the optical flow (H,W,2) between two exposures in pixels, right and down.
 
-    It includes ego-motion; moving objects keep their velocity. Pixels under a laser spot take the
-    flow of the nearest pixel with a point, other filled pixels have none. ``depth_map`` is that of
-    the cloud at ``exposure``, where the flow starts.
+    The flow includes ego-motion, and moving objects keep their velocity. Pixels under a laser spot
+    take the flow of the nearest pixel with a point. Other pixels have NaN. ``depth_map`` is the map
+    of the cloud at ``exposure``, where the flow starts. The flow ends at ``target``.
     """
     chosen = np.flatnonzero(depth_map.reason == Reason.KEPT)
     points, velocity_m_s = cloud.points[chosen], cloud.velocity_m_s[chosen]
@@ -330,7 +330,7 @@ def with_ages(
     """Return the map with ``age_s``, seconds between its time and the source sweep of each pixel.
 
     A filled pixel has the age of the nearest measured pixel in the image. The map shows the time
-    ``late_s`` seconds after the key sweep. ``stamps_ns`` has the times of the sweeps by frame.
+    ``late_s`` seconds after the key sweep. ``stamps_ns`` has the times of sweeps by frame number.
     """
     shown_ns = stamps_ns[key] + round(1e9 * late_s)
     measured = depth_map.depth_m > 0
@@ -364,7 +364,7 @@ class HeldOut:
 
     @staticmethod
     def of(views: Views, cloud: Cloud) -> HeldOut:
-        """Return the ground truth of a key sweep from the window's cloud, with its velocities."""
+        """Return the key sweep's returns in a window's cloud as ground truth, with velocities."""
         settings = replace(views.settings, rims="strict", visibility=True)
         key_cloud = cloud.select(cloud.frame == views.key)
         seen = views.see(key_cloud)
@@ -382,11 +382,11 @@ class HeldOut:
         return HeldOut(views, truth_m, moving, float(np.median(gap_rad)) if len(gap_rad) else 0.0)
 
     def judged_maps(self, seen: SeenCloud, visible: bool) -> dict[str, JudgedMap]:
-        """Return each map of a cloud without the key sweep, by name; {} if no points remain."""
+        """Return each map of a cloud without the key sweep, by name, or {} if no points remain."""
         keep = seen.cloud.frame != self.views.key
         if not keep.any():
             return {}
-        # Without the key sweep's evidence on bodies too
+        # Bodies are made without the rays of the key sweep, too.
         cloud = seen.cloud.select(keep)
         bodies = without_sweep(seen.bodies, cloud, self.views.key)
         in_view = self.views.points_in_view(cloud)
@@ -395,6 +395,7 @@ class HeldOut:
         for name, depth_map in self.views.depth_maps(neighbours_only, visible).items():
             moving, truth_m = self.moving[name], self.truth_m[name]
             exposure = self.views.exposures[name]
+            # Returns through glass, from seats or the far side, are no truth of the surface.
             inside = moving & find_far_inside(seen.bodies.values(), exposure, truth_m)
             truth_m = np.where(inside, np.float32(0), truth_m)
             judged_maps[name] = JudgedMap(depth_map, truth_m, moving & ~inside)

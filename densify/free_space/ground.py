@@ -24,7 +24,7 @@ _WINDOW = 7  # width in cells; a narrower hump or pit is not ground
 
 
 def ground(stretch: Stretch) -> HeightMap:
-    """Return the ground height under all sweeps of a window, in the world frame with z up."""
+    """Return the height of the ground under all sweeps of a window, in the world frame, z up."""
     clouds = [
         poses.transform(registered.T_world_lidar, registered.sweep.points)
         for registered in stretch.sweeps
@@ -42,35 +42,36 @@ class HeightMap:
 
     @staticmethod
     def of(clouds: Sequence[Float]) -> HeightMap:
-        """Return the ground height under clouds of (N,3) points, z up, at least one point in all.
+        """Return the height of the ground under clouds of points (N,3), z up, at least one in all.
 
-        The ground of a cell is the median over the clouds of the lowest points, without mirror
+        The height in a cell is the median over the clouds of the lowest points, without mirror
         images from below the road. A limit on the slope removes cars and walls.
         """
         gridded, low_m, shape = _fit_grid(clouds)
-        cells = [_cells_of(points, low_m, shape[1]) for points in gridded]
-        heights = _median_of_lowest(gridded, cells, shape[0] * shape[1]).reshape(shape)
-
-        is_measured = np.isfinite(heights)
+        cell_numbers = [_cells_of(points, low_m, shape[1]) for points in gridded]
+        # Cells without a point have the height inf, until they take that of the nearest other cell.
+        heights_m = _median_lowest(gridded, cell_numbers, shape[0] * shape[1]).reshape(shape)
+        is_measured = np.isfinite(heights_m)
         nearest_cell = tuple(ndimage.distance_transform_edt(~is_measured, return_indices=True)[1])
+
         # A cell lower than the greatest slope allows over half a window is a mirror image.
-        median_m = ndimage.median_filter(heights[nearest_cell], _WINDOW)
+        median_m = ndimage.median_filter(heights_m[nearest_cell], _WINDOW)
         rise_m = _MAX_SLOPE * _CELL_M
-        is_pit = is_measured & (heights < median_m - rise_m * (_WINDOW // 2))
-        heights = np.where(is_pit, median_m, heights)
-        heights = _limit_slope(heights, rise_m)[nearest_cell]
+        is_pit = is_measured & (heights_m < median_m - rise_m * (_WINDOW // 2))
+        heights_m = np.where(is_pit, median_m, heights_m)
+        heights_m = _limit_slope(heights_m, rise_m)[nearest_cell]
 
         # Narrow humps, such as a vehicle that is always parked, are removed. Slopes and kerbs stay.
         # Morphological opening: Zhang et al., "A Progressive Morphological Filter for Removing
         # Nonground Measurements from Airborne LIDAR Data", TGRS 2003.
-        opened = ndimage.grey_opening(heights, (_WINDOW, _WINDOW))
-        hull_m = np.where(heights - opened > ABOVE_GROUND_M, opened, heights)
-        # The hull is a lower bound of the ground, which is the mean of the points close to it.
+        opened_m = ndimage.grey_opening(heights_m, (_WINDOW, _WINDOW))
+        hull_m = np.where(heights_m - opened_m > ABOVE_GROUND_M, opened_m, heights_m)
+        # The hull is a lower bound of the ground. The ground is the mean of the points close to it.
         hull = HeightMap(hull_m, low_m, _CELL_M)
-        return HeightMap(_average_heights(hull, gridded, cells), low_m, _CELL_M)
+        return HeightMap(_mean_heights(hull, gridded, cell_numbers), low_m, _CELL_M)
 
     def under(self, points: Float) -> Float:
-        """Return (N,) ground heights, metres, at points (N,2 or 3); beyond the grid its edge's."""
+        """Return the ground's height (N,), m, at points (N,2 or 3), beyond the grid at its edge."""
         ground_m = np.empty(len(points))
         _interpolate.over_rows(
             len(points),
@@ -83,14 +84,17 @@ class HeightMap:
         return ground_m
 
     def above(self, points: Float) -> Float32:
-        """Return the (N,) height in metres of points (N,3) above the ground."""
+        """Return the heights (N,) in metres of points (N,3), frame of the map, above the ground."""
         height_m: Float32 = (points[:, 2] - self.under(points)).astype(np.float32)
         return height_m
 
     def below(self, points: Float, T_world_lidar: Float) -> Bool:
-        """Return (N,) True for points (N,3, lidar frame) within 30 m clearly below the ground."""
-        # Farther away not every sweep measures the ground. Returns from 0.5 m below it are mirror
-        # images or multipath.
+        """Return the mask (N,) of points that are within 30 m and over 0.5 m below the ground.
+
+        Points (N,3) are in the lidar frame. ``T_world_lidar`` leads to the frame of the map.
+        """
+        # Farther away not every sweep measures the ground. Returns from 0.5 m below the ground are
+        # mirror images or multipath.
         rows = np.flatnonzero(np.hypot(points[:, 0], points[:, 1]) < 30.0)
         is_below = np.zeros(len(points), bool)
         is_below[rows] = self.above(poses.transform(T_world_lidar, points[rows])) < -0.5
@@ -99,10 +103,10 @@ class HeightMap:
 
 @Kernel
 def _interpolate(begin, end, points, heights_m, low_m, cell_m, ground_m):  # type: ignore[no-untyped-def]
-    """Fill ``ground_m`` (N,) by bilinear interpolation between the middles of cells."""
+    """Fill ``ground_m`` (N,) with heights interpolated bilinearly between the middles of cells."""
     num_x, num_y = heights_m.shape
     for i in range(begin, end):
-        # In this order NaN becomes 0.
+        # Position in cells from the middle of the first cell. In this order NaN becomes 0.
         x = min(max(0.0, (points[i, 0] - low_m[0]) / cell_m - 0.5), num_x - 1.0)
         y = min(max(0.0, (points[i, 1] - low_m[1]) / cell_m - 0.5), num_y - 1.0)
         row, column = int(x), int(y)
@@ -114,12 +118,13 @@ def _interpolate(begin, end, points, heights_m, low_m, cell_m, ground_m):  # typ
 
 
 def _fit_grid(clouds: Sequence[Float]) -> tuple[list[Float], Float, tuple[int, int]]:
-    """Return the clouds (N,3) without the few points too far away for a grid, and that grid.
+    """Return the clouds (N,3) without the few points too far away for a grid, and the grid.
 
-    The grid is given by its (2,) lower corner in metres and its numbers of cells.
+    The grid is given by its (2,) lower corner in metres and its numbers of cells in x and y.
     """
 
     def find_bounds(clouds: Sequence[Float]) -> tuple[Float, Float]:
+        """Return the lower and the upper corner (2,) of the box around all points."""
         low_m = [min(points[:, k].min(initial=np.inf) for points in clouds) for k in (0, 1)]
         high_m = [max(points[:, k].max(initial=-np.inf) for points in clouds) for k in (0, 1)]
         return np.array(low_m), np.array(high_m)
@@ -142,32 +147,33 @@ def _cells_of(points: Float, low_m: Float, num_y: int) -> Int:
     return x * num_y + y
 
 
-def _median_of_lowest(clouds: Sequence[Float], cells: Sequence[Int], num_cells: int) -> Float:
+def _median_lowest(clouds: Sequence[Float], cell_numbers: Sequence[Int], num_cells: int) -> Float:
     """Return the (num_cells,) median over clouds of their lowest points, inf in empty cells."""
     lowest_m = np.full((len(clouds), num_cells), np.nan, np.float32)
-    for points, cell, cloud_lowest_m in zip(clouds, cells, lowest_m, strict=True):
+    for points, cell, cloud_lowest_m in zip(clouds, cell_numbers, lowest_m, strict=True):
         z = points[:, 2]
-        # Cell numbers are integers. A height scaled to less than 1 orders the points of a cell.
+        # Sort by cell, then by height. Cell numbers are integers, and heights scaled to less than 1
+        # order the points of a cell.
         scaled_height = (z - z.min(initial=0)) / (z.max(initial=0) - z.min(initial=0) + 1)
         order = np.argsort(cell + scaled_height)
-        first = np.flatnonzero(np.diff(cell[order], prepend=-1))  # lowest point of each cell
-        num_points = np.diff(first, append=len(order))
-        # Up to 2 % of the points of a cell are mirror images or noise. At least the lowest one is
-        # passed over, if the cell has two.
+        cell_start = np.flatnonzero(np.diff(cell[order], prepend=-1))  # lowest point of each cell
+        num_points = np.diff(cell_start, append=len(order))
+        # Up to 2 % of the points of a cell are mirror images or noise. At least the lowest point is
+        # skipped, if the cell has two.
         num_outliers = np.maximum(1, (0.02 * num_points).astype(int))
-        ground_row = order[first + np.minimum(num_points - 1, num_outliers)]
-        cloud_lowest_m[cell[order[first]]] = z[ground_row]
+        ground_row = order[cell_start + np.minimum(num_points - 1, num_outliers)]
+        cloud_lowest_m[cell[order[cell_start]]] = z[ground_row]
     is_measured = ~np.isnan(lowest_m).all(axis=0)
-    heights = np.full(num_cells, np.inf)
-    heights[is_measured] = np.nanmedian(lowest_m[:, is_measured], axis=0)
-    return heights
+    heights_m = np.full(num_cells, np.inf)
+    heights_m[is_measured] = np.nanmedian(lowest_m[:, is_measured], axis=0)
+    return heights_m
 
 
-def _average_heights(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[Int]) -> Float:
+def _mean_heights(hull: HeightMap, clouds: Sequence[Float], cell_numbers: Sequence[Int]) -> Float:
     """Return the (X,Y) mean height of the points close to the hull around each cell."""
     # The hull is lower where more points were measured: an object driving there would climb.
     sum_m, num_points = np.zeros((2, hull.heights_m.size))
-    for points, cell in zip(clouds, cells, strict=True):
+    for points, cell in zip(clouds, cell_numbers, strict=True):
         above_hull_m = points[:, 2] - hull.under(points)
         rows = np.flatnonzero(np.abs(above_hull_m) < _MAX_SLOPE * _CELL_M)
         np.add.at(num_points, cell[rows], 1)
@@ -181,24 +187,24 @@ def _average_heights(hull: HeightMap, clouds: Sequence[Float], cells: Sequence[I
     return mean_m
 
 
-def _limit_slope(heights: Float, rise_m: float) -> Float:
-    """Return the largest map below ``heights`` that rises by at most ``rise_m`` per cell."""
+def _limit_slope(heights_m: Float, rise_m: float) -> Float:
+    """Return the (X,Y) heights lowered until they rise by at most ``rise_m`` per cell."""
     cone = -rise_m * np.hypot(*np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]))
-    # A low cell limits its neighbours, these limit theirs, and so on.
+    # A low cell limits its neighbours, these limit their own, and so on.
     while True:
-        lower = ndimage.grey_erosion(heights, structure=cone, mode="nearest")
-        if np.array_equal(lower, heights):
-            return lower
-        heights = lower
+        lower_m = ndimage.grey_erosion(heights_m, structure=cone, mode="nearest")
+        if np.array_equal(lower_m, heights_m):
+            return lower_m
+        heights_m = lower_m
 
 
 def find_upright(sweeps: Sequence[Sweep]) -> Float:
-    """Return the (3,3) rotation ``R_level_lidar`` from the lidar frame to level axes, z up.
+    """Return the rotation ``R_level_lidar`` (3,3) from the lidar frame to level axes, z up.
 
-    RANSAC (Fischler, Bolles, 1981) finds the ground plane: most points are on it, few below it.
-    Without one the result is the identity. Slopes below 0.075 are not levelled.
+    RANSAC (Fischler, Bolles, 1981) finds the ground plane. Most points are on this plane, and few
+    below. Slopes below 0.075 are not levelled. Without ground the result is the identity.
     """
-    stride = sum(map(len, sweeps)) // 2000 + 1
+    stride = sum(map(len, sweeps)) // 2000 + 1  # 2000 points of all sweeps are enough
     points = np.concatenate([sweep.points[::stride] for sweep in sweeps])
     for R_turned_lidar in (np.eye(3), np.diag([1.0, -1.0, -1.0])):  # as measured, and upside down
         up = _ground_normal(points @ R_turned_lidar.T)
@@ -215,7 +221,7 @@ def _ground_normal(points: Float) -> Float | None:
     if len(points) < 3:
         return None
 
-    # Planes through random triples of points, with the normal upwards
+    # Planes through 200 random triples of points, with the normal upwards
     rng = np.random.default_rng(0)
     corners = points[rng.integers(len(points), size=(200, 3))]
     corner_a, corner_b, corner_c = corners.transpose(1, 0, 2)
@@ -231,7 +237,7 @@ def _ground_normal(points: Float) -> Float | None:
     share_on = np.where(plane_z_m < 0, on_plane.mean(axis=0), 0)
     share_below = (height_m < -ABOVE_GROUND_M).mean(axis=0)
     score = share_on - share_below
-    if score.max(initial=0) < 0.1:
+    if score.max(initial=0) < 0.1:  # no ground in view
         return None
 
     # The normal is the direction in which the points of the plane vary least.

@@ -79,9 +79,10 @@ class RangeImage:
 
     @staticmethod
     def of(registered: RegisteredSweep, num_together: int = 1, by_ring: bool = False) -> RangeImage:
-        """Return the range images of a deskewed sweep.
+        """Return the range images of a sweep, at least one for each of its scanners.
 
         Args:
+            registered: Deskewed sweep with its twists.
             num_together: Number of sweeps whose counts are added up. The columns are finer by this
                 factor.
             by_ring: True also uses single rings: dense rings for far points, where an error of
@@ -92,7 +93,7 @@ class RangeImage:
             rays = aim_rays(registered, lidar)
             for cells in _choose_cells(rays, num_together, by_ring):
                 images.append(_make_image(registered, lidar, rays, cells))
-                # Still larger cells would call the gaps between returns free.
+                # Enough rays can be tested. Larger cells would call the gaps between returns free.
                 if cells.may_be_last and _share_testable(images[-1], rays) >= 0.8:
                     break
         return RangeImage(tuple(images))
@@ -105,12 +106,13 @@ class RangeImage:
         min_filled: int = _MIN_FILLED,
         velocity_m_s: Float | Float32 | None = None,
     ) -> Bool:
-        """Return (N,) True where the space at points (N,3) is certainly free.
+        """Return the mask (N,) of the points that the sweep certainly saw through.
 
         At least ``min_filled`` of the 3 x 3 cells around a point's direction must hold a return.
-        Every return in them must be farther than the point by more than ``max(margin_m,
+        Every return in these cells must be farther than the point by more than ``max(margin_m,
         margin_fraction * range)``. A larger margin tolerates errors of registration, but misses
-        moving objects close to a background. All other arguments are those of `count_beyond`.
+        moving objects close to a background. Points are in the lidar frame at the reference time,
+        and velocities (N,3) without ego-motion in the same frame, None for static points.
         """
         margins = margin_m, margin_fraction
         num_beyond = self.count_beyond(points, margins, min_filled, velocity_m_s)
@@ -123,18 +125,21 @@ class RangeImage:
         min_filled: int = 1,
         velocity_m_s: Float | Float32 | None = None,
     ) -> NDArray[np.int16]:
-        """Return the (S,N) number of filled cells around each of N points in each of S images.
+        """Return the number of cells with a return around each point whose returns are all beyond.
 
-        The 3 x 3 cells around a point's direction are counted. The count is 0 if fewer than
-        ``min_filled`` cells are filled, and far below 0 if a return in them is not beyond the
-        point. The counts of several sweeps may be added.
+        The 3 x 3 cells around a point's direction are counted, in each image. The counts of several
+        sweeps may be added.
 
         Args:
             points: (N,3) positions in metres, lidar frame at the reference time of the sweep.
             margins: Least distance of a return beyond a point: metres, and share of the range. The
                 larger one counts.
-            min_filled: Least number of filled cells.
+            min_filled: Least number of cells with a return.
             velocity_m_s: (N,3) lidar frame, without ego-motion; None for static points.
+
+        Returns:
+            (S,N) counts in S images: 0 if fewer than ``min_filled`` cells have a return, far below
+            0 if one of the returns is not beyond the point.
         """
         points32 = np.ascontiguousarray(points, np.float32)
         velocity = np.zeros((1, 3)) if velocity_m_s is None else velocity_m_s
@@ -163,7 +168,7 @@ class FreeSpace:
 
     @staticmethod
     def of(stretch: Stretch) -> FreeSpace:
-        """Return the free space of a window of registered, deskewed sweeps."""
+        """Return the free space that the registered, deskewed sweeps of a window observed."""
         clock = Clock.of(stretch)
         batches = clock.batches()
         make_image = partial(RangeImage.of, num_together=max(map(len, batches)), by_ring=True)
@@ -173,12 +178,12 @@ class FreeSpace:
         return FreeSpace(images, T_lidar_world, clock, Sensors.of(stretch.sweeps), batches)
 
     def gap_m(self, position: Float, i: int) -> float:
-        """Return the metres between neighbouring rings of sweep i at a (3,) world position."""
+        """Return the distance (m) between rings of sweep i, at a (3,) world position."""
         position_lidar = poses.transform(self.T_lidar_world[i], position[None])
         return float(self.sensors.finest_gap_m(position_lidar)[0])
 
     def others(self, i: int) -> list[int]:
-        """Return the first sweep's index of each other batch within `REACH_S` of sweep i."""
+        """Return the index of the first sweep of each other batch within 1 s of sweep i."""
         return [
             batch[0]
             for batch in self.batches
@@ -186,10 +191,10 @@ class FreeSpace:
         ]
 
     def seen_through(self, points: Float, j: int, velocity_m_s: Float | None = None) -> Bool:
-        """Return (N,) True where the batch of sweep j certainly observed free space.
+        """Return the mask (N,) of the points that the batch of sweep j certainly saw through.
 
         Every return near the direction of the point must be clearly farther away, in all sweeps of
-        the batch. Together the sweeps must have enough returns there.
+        the batch. Together the sweeps must have enough returns near this direction.
 
         Args:
             points: (N,3) positions in the world frame at the reference time of sweep j.
@@ -197,7 +202,7 @@ class FreeSpace:
             velocity_m_s: (N,3) velocities in the world frame, None for static points.
         """
         batch = next(batch for batch in self.batches if j in batch)
-        # Of several sweeps the sum must have enough filled cells, and not each of them.
+        # With several sweeps only the sum of their counts must be large enough.
         min_filled = _MIN_FILLED if len(batch) == 1 else 1
         counts = []  # one (S,N) array of `count_beyond` for each sweep of the batch
         for k in batch:
@@ -205,7 +210,7 @@ class FreeSpace:
             points_k, velocity_lidar = points, None
             if velocity_m_s is not None:
                 velocity_lidar = poses.rotate(T_lidar_world, velocity_m_s)
-                if k != j:
+                if k != j:  # the points move on to the time of sweep k
                     duration_s = self.clock.time_s[k] - self.clock.time_s[j]
                     points_k = points + duration_s * velocity_m_s
             points_lidar = poses.transform(T_lidar_world, points_k)
@@ -233,7 +238,7 @@ class _Cells(NamedTuple):
 def _make_image(
     registered: RegisteredSweep, lidar: int, rays: AimedRays, cells: _Cells
 ) -> ScannerImage:
-    """Return the range image of one scanner, made from its rays."""
+    """Return the range image of scanner number ``lidar``, made from its rays."""
     sweep = registered.sweep
     shape = len(cells.row_edges_rad) - 1, cells.num_columns
     row, column = _cell_of(rays, cells.row_edges_rad, cells.num_columns)
@@ -251,9 +256,7 @@ def _make_image(
     if fires_by_azimuth(rays):
         first_s = last_s = _offset_per_column(column, rays.offset_s, cells.num_columns)[None]
     else:
-        first_s = _reduce_3x3(np.minimum, np.inf, cell, rays.offset_s[in_rows], shape)
-        last_s = _reduce_3x3(np.maximum, -np.inf, cell, rays.offset_s[in_rows], shape)
-        first_s[np.isinf(first_s)] = last_s[np.isinf(last_s)] = 0  # no ray in the nine cells
+        first_s, last_s = _cell_times(cell, rays.offset_s[in_rows], shape)
     half = np.float32(0.5)  # stays in float32
     return ScannerImage(
         offset_s=half * (first_s + last_s),
@@ -281,9 +284,9 @@ def _cell_of(rays: AimedRays, row_edges_rad: Float32, num_columns: int) -> tuple
 def _reduce_3x3(
     join: np.ufunc, empty: float, cell: Int, values: Float32, shape: tuple[int, int]
 ) -> Float32:
-    """Return the values (N,) joined over the 3 x 3 cells around each of (R,C), ``empty`` if none.
+    """Return the (R,C) result of joining the values in the 3 x 3 cells around each cell.
 
-    ``cell`` (N,) is the flat index of each value's cell.
+    Without values the result is ``empty``. ``cell`` (N,) is the flat index of each value's cell.
     """
     joined = np.full(shape, empty, np.float32)
     join.at(joined.reshape(-1), cell, values)
@@ -291,14 +294,22 @@ def _reduce_3x3(
 
 
 def _join_3x3(join: Callable[..., Any], cells: NDArray[Any], empty: float) -> NDArray[Any]:
-    """Join each of the (R,C) cells with its eight neighbours, ``empty`` outside; columns wrap."""
+    """Return the (R,C) cells joined with their eight neighbours. Columns wrap around."""
     in_row = join(join(np.roll(cells, 1, axis=1), cells), np.roll(cells, -1, axis=1))
     padded = np.pad(in_row, ((1, 1), (0, 0)), constant_values=empty)
     return np.asarray(join(join(padded[:-2], padded[1:-1]), padded[2:]))
 
 
+def _cell_times(cell: Int, offset_s: Float32, shape: tuple[int, int]) -> tuple[Float32, Float32]:
+    """Return the (R,C) first and last firing time (s) in the 3 x 3 cells around each, 0 if none."""
+    first_s = _reduce_3x3(np.minimum, np.inf, cell, offset_s, shape)
+    last_s = _reduce_3x3(np.maximum, -np.inf, cell, offset_s, shape)
+    first_s[np.isinf(first_s)] = last_s[np.isinf(last_s)] = 0  # no ray in the nine cells
+    return first_s, last_s
+
+
 def _offset_per_column(column: Int, offset_s: Float32, num_columns: int) -> Float32:
-    """Return the (C,) mean firing time of each column, interpolated in columns without rays."""
+    """Return the (C,) mean firing time (s) of each column, interpolated in columns without rays."""
     num_rays = np.bincount(column)
     with_rays = np.flatnonzero(num_rays)
     if not len(with_rays):
@@ -314,9 +325,9 @@ def _share_testable(image: ScannerImage, rays: AimedRays) -> float:
 
 
 def _choose_cells(rays: AimedRays, num_together: int, by_ring: bool) -> list[_Cells]:
-    """Choose the cells of one scanner's images, finest first; arguments as in `RangeImage.of`."""
+    """Return the cells of one scanner's images, the finest first."""
     if len(rays.azimuth) < FEW_POINTS:  # too few to measure their layout
-        return [_uniform_cells(rays, *np.deg2rad([2.0, 1.0]))]
+        return [_uniform_cells(rays, row_rad=np.deg2rad(2.0), column_rad=np.deg2rad(1.0))]
     layout = measure_layout([rays])
     column_rad = _CELLS_PER_STEP * (layout.azimuth_step_rad / num_together)
     if layout.rings_rad is not None:
@@ -338,20 +349,20 @@ def _choose_cells(rays: AimedRays, num_together: int, by_ring: bool) -> list[_Ce
 def _cells_of_rings(rings: Float, column_rad: float, by_ring: bool) -> list[_Cells]:
     """Return the cells of a scanner with rings (K,), of a second image too if ``by_ring``."""
     borders = 0.5 * (rings[1:] + rings[:-1])
-    # The first and the last ring are in the middle of their rows.
+    # The first and the last ring are in the middle of their rows, too.
     outer: Float = 2 * rings[[0, -1]] - borders[[0, -1]]
     edges: Float = np.concatenate([outer[:1], borders, outer[1:]])
     near_cells = _grid(_merge_rows(edges, 3 * _MIN_FAR_ROW_RAD), column_rad)
     far_edges = _merge_rows(edges, _MIN_FAR_ROW_RAD)
     if by_ring and len(near_cells.row_edges_rad) != len(far_edges):
-        # A point's 3 x 3 cells reach 1.5 rows up and down. From this range on that is more than the
+        # A point's 3 x 3 cells reach 1.5 rows up and down, from the range ``far_m`` on over the
         # error of registration, 0.1 m.
         far_m = 0.1 / (1.5 * float(np.diff(far_edges).min()))
         far_cells = _grid(far_edges, column_rad)
         return [near_cells._replace(to_m=far_m), far_cells._replace(from_m=far_m)]
 
-    # A ring 1 degree from all others observes free space only at its rays. A row is around each
-    # such ring, and a row between two of them.
+    # A ring at least 1 degree from all others is alone: it observes free space only at its rays.
+    # A second image has a row around each lone ring, and a row between two lone rings.
     gap_rad = np.diff(rings, prepend=-np.inf, append=np.inf)
     is_lone = np.minimum(gap_rad[:-1], gap_rad[1:]) >= np.deg2rad(1.0)
     if not by_ring or not is_lone.any():
@@ -367,17 +378,17 @@ def _grid(row_edges_rad: NDArray[np.floating], column_rad: float) -> _Cells:
 
 
 def _merge_rows(edges: Float, min_rad: float) -> Float:
-    """Drop edges until rows have at least this height. The first and the last edge stay."""
+    """Return the first and last edge, and edges between that are at least ``min_rad`` apart."""
     merged = [edges[0]]
     for edge in edges[1:]:
         if edge - merged[-1] >= min_rad:
             merged.append(edge)
-    # The last edge replaces the last one found, unless that is the first edge.
+    # The last edge replaces the last edge that was kept, unless that is the first edge.
     return np.array([*merged[: max(1, len(merged) - 1)], edges[-1]])
 
 
 def _uniform_cells(rays: AimedRays, row_rad: float, column_rad: float) -> _Cells:
-    """Return cells in equal rows that cover the elevations of all rays and 0."""
+    """Return cells in equal rows that cover the elevations of all rays and elevation 0."""
     # The lowest ray is in the middle of its row.
     low_rad = float(rays.elevation.min(initial=0.0)) - 0.5 * row_rad
     num_rows = int((float(rays.elevation.max(initial=0.0)) - low_rad) / row_rad) + 1
@@ -389,14 +400,14 @@ def _column(azimuth, num_columns):  # type: ignore[no-untyped-def]
     """Return the column of an azimuth, 0 for NaN. Columns start behind the scanner."""
     if not abs(azimuth) <= PI:  # True for NaN
         return np.int32(0)
-    # 32 bits, because more of them fit into a vector instruction.
+    # 32 bits, because more such numbers fit into a vector instruction.
     column = np.int32((azimuth + PI) * (np.float32(num_columns) / (PI + PI)))
     return column - np.int32(num_columns) if column >= num_columns else column
 
 
 @inlined
 def _fill_rows(elevation, size, edges, row):  # type: ignore[no-untyped-def]
-    """Fill ``row`` with the interval of the ascending edges of each elevation, -1 outside."""
+    """Fill ``row`` with the interval of ascending edges that holds each elevation, -1 outside."""
     # A binary search for many elevations at once. The inner loop, of equal steps, is vectorized.
     last, step = np.int32(len(edges) - 1), np.int32(1)
     row[:size] = 0
@@ -426,11 +437,12 @@ def _speed_of(point, velocity, twist):  # type: ignore[no-untyped-def]
 def _find_cells(points, velocity, start, size, image, x, y, z, time_s, elevation, row, column):  # type: ignore[no-untyped-def]
     """Find when and in which cell the scanner faced ``size`` points from index ``start`` on.
 
-    Fills in the position x, y, z in the scanner's frame at that time, the time, the elevation, and
-    the row (-1 outside the image) and column of the cell. ``velocity`` is (N,3), or (1,3) for all.
+    Fills the arrays, one value for each point: position x, y, z in the scanner's frame at that
+    time, the time, the elevation, and the row (-1 outside the image) and column of the cell.
+    ``velocity`` is (N,3), or (1,3) for all.
     """
     # The time gives the position, the position gives the cell, and the cell gives the time. Two
-    # iterations from the position at the reference time converge; the third finds the last cell.
+    # iterations from the position at the reference time converge. The third finds the last cell.
     num_columns, by_azimuth = image.nearest_m.shape[1], len(image.offset_s) == 1
     time_s[:size] = ZERO
     for iteration in range(3):
@@ -482,7 +494,7 @@ def _count_beyond(begin, end, points, velocity, image, margins, min_filled, num_
                 if error_s > max_error_s:
                     continue
             else:
-                # Within the uncertain time the point may have moved.
+                # Within the uncertain time the point may move.
                 error_s += image.spread_s[r, c]
                 twist = image.twists[0 if time_s[k] < ZERO else 1]
                 speed_m_s = _speed_of(points[i], velocity[min(i, len(velocity) - 1)], twist)

@@ -48,12 +48,12 @@ def _cell_numbers(coordinates: Float) -> Int:
 def remove_lone_returns(sweep: Sweep) -> Sweep:
     """Return the sweep without lone returns if their number suggests snow, rain or dust.
 
-    The result counts them in ``num_lone``. The volume searched around a return grows with its range
-    (Charron et al., "De-noising of Lidar Point Clouds Corrupted by Snowfall", CRV 2018). It is a
-    cell of direction and logarithm of range. The sweep is returned unchanged if it has few points,
-    few returns alone in a cell, or more lone returns than others.
+    The result counts the lone returns in ``num_lone``: up to five in a cell of direction and
+    logarithm of range, which grows with the range (Charron et al., "De-noising of Lidar Point
+    Clouds Corrupted by Snowfall", CRV 2018). The sweep is returned unchanged if it has fewer than
+    1000 points, few returns alone in a cell, or more lone returns than others.
     """
-    if len(sweep) < 1000:
+    if len(sweep) < 1000:  # the share of lone returns would be chance
         return sweep
     coordinates = _cell_coordinates(sweep)
     # In good weather up to 0.4 % of the returns of real sweeps are single in their cell.
@@ -62,7 +62,7 @@ def remove_lone_returns(sweep: Sweep) -> Sweep:
     if np.count_nonzero(num_in_cell == 1) <= max_single:
         return sweep
     # The larger count of two grids, half a cell apart: a surface may lie on a cell border.
-    shift = [[0.0], [0.5], [0.5], [0.5]]  # none between scanners
+    shift = [[0.0], [0.5], [0.5], [0.5]]  # the scanner's number is not shifted
     num_in_cell = np.maximum(num_in_cell, _count_in_cells(coordinates + shift))
     is_lone = num_in_cell <= 5
     is_sparse = 2 * np.count_nonzero(is_lone) > len(sweep)
@@ -74,8 +74,8 @@ def remove_lone_returns(sweep: Sweep) -> Sweep:
 def _cell_coordinates(sweep: Sweep) -> Float:
     """Return the (4,N) scanner, azimuth, elevation and log range of the returns, in cells."""
     origins_m, lidar = sweep.scanner_origins, sweep.lidar
-    # Cells are 2 degrees wide, and 8 % of the range deep. They have some 50 rays of a sweep of
-    # 120,000 points. The cells of a sparser scanner are larger, and have about as many rays.
+    # Cells are 2 degrees wide, and 8 % of the range deep. In a sweep of 120,000 points a cell has
+    # some 50 rays. The cells of a sparser scanner are larger, and have about as many rays.
     per_rad = np.sqrt(np.bincount(lidar) / 120_000) / np.radians(2.0)
     coordinates = np.empty((4, len(sweep)))
     coordinates[0] = lidar
@@ -101,16 +101,16 @@ def _count_in_cells(coordinates: Float) -> Int:
 
 
 def count_by_azimuth(sweep: Sweep) -> Int:
-    """Return the (360,) number of returns of a raw sweep in each degree of azimuth from -180."""
+    """Return the numbers of returns (360,) of a raw sweep, by degree of azimuth from -180 on."""
     edges_rad = np.linspace(-np.pi, np.pi, 361)
     return np.histogram(np.arctan2(sweep.points[:, 1], sweep.points[:, 0]), edges_rad)[0]
 
 
 def lost_deg(returns: Int) -> Float:
-    """Return the (n,) degrees of azimuth that each sweep lacks and others measured.
+    """Return the number (n,) of degrees of azimuth that each sweep lacks and other sweeps measured.
 
-    A degree counts as measured if a quarter of the sweeps have returns in it, not just single ones.
-    ``returns`` (n,360) are the numbers of returns of each sweep, from `count_by_azimuth`.
+    A degree counts as measured if a quarter of the sweeps have more than single returns in it.
+    ``returns`` (n,360) are the numbers of returns of each sweep by degree of azimuth.
     """
     num_usual = np.quantile(returns, 0.75, axis=0)
     # A degree with much fewer returns than the mean may be empty by chance.
@@ -119,24 +119,28 @@ def lost_deg(returns: Int) -> Float:
 
 
 def blind_sector(returns: Int) -> tuple[int, int] | None:
-    """Return the first and last azimuth (deg, counterclockwise from x) that no sweep measured.
+    """Return the widest sector of azimuth that no sweep measured, None if there is none.
 
-    It is the widest gap of 3 to 90 degrees. None if there is none, or if no sweep has a return.
-    Wider gaps are the limits of the scanner's field of view. ``returns`` (n,360) are the numbers of
-    returns of each sweep, from `count_by_azimuth`.
+    The sector is 3 to 90 degrees wide. Without any return the result is None. ``returns`` (n,360)
+    are the numbers of returns of each of n sweeps by degree of azimuth from -180 on.
+
+    Returns:
+        begin_deg: Azimuth of the right edge, -180 to 179, counterclockwise from x.
+        end_deg: Azimuth of the left edge. It exceeds 180 if the sector contains the backward
+            direction.
     """
     measured_deg = np.flatnonzero(returns.any(axis=0))
     if not len(measured_deg):
         return None
-    # From each measured degree to the next, around the circle; neighbours have a gap of 0.
+    # Width between each measured degree and the next, around the circle: 0 between neighbours
     gap_deg = np.diff(measured_deg, append=measured_deg[0] + 360) - 1
-    gap_deg[gap_deg > 90] = 0
+    gap_deg[gap_deg > 90] = 0  # a limit of the field of view
     widest = int(np.argmax(gap_deg))
-    if gap_deg[widest] < 3:
+    if gap_deg[widest] < 3:  # may be chance
         return None
     # The gap begins after the measured degree. Number 0 is at -180 degrees.
-    begin = int(measured_deg[widest] + 1) % 360 - 180
-    return begin, begin + int(gap_deg[widest])
+    begin_deg = int(measured_deg[widest] + 1) % 360 - 180
+    return begin_deg, begin_deg + int(gap_deg[widest])
 
 
 # --- the position of the scanner: from it, fewest returns lie behind others
@@ -145,50 +149,57 @@ def blind_sector(returns: Int) -> tuple[int, int] | None:
 def in_map_frame(
     sweeps: Sequence[Sweep], trajectory: Trajectory, recorded: Trajectory | None
 ) -> str:
-    """Return why raw sweeps seem to be in the frame of a map, "" if they seem not to be.
+    """Return why raw sweeps seem to be in the frame of a map, or "" if they do not seem to be.
 
-    ``trajectory`` are the registered poses of the sweeps. They are from the ``recorded`` poses, or
-    from odometry if ``recorded`` is None.
+    Args:
+        sweeps: Raw sweeps in ascending order of time.
+        trajectory: Registered poses of the sweeps.
+        recorded: Recorded poses of the sweeps, None if the trajectory is from odometry.
     """
     if recorded is not None:
-        is_placed = are_placed(sweeps, recorded.T_world_lidar)
-        return "the rays begin at the sweeps' poses" if is_placed else ""
+        begins_at_poses = rays_begin_at_poses(sweeps, recorded.T_world_lidar)
+        return "the rays begin at the sweeps' poses" if begins_at_poses else ""
     if is_still(trajectory.T_world_lidar) and (way_m := way_in_map(sweeps[0], sweeps[-1])):
         return f"odometry finds no motion, but the rays of both begin {way_m:.1f} m apart"
     return ""
 
 
 def is_still(T_world_lidar: Float) -> bool:
-    """Return True if the poses (n,4,4) of odometry hardly move, as between sweeps in a map."""
+    """Return True if odometry's poses (n,4,4) move by at most 0.5 m, as of sweeps in a map."""
     return bool(np.linalg.norm(np.ptp(T_world_lidar[:, :3, 3], axis=0)) <= _MIN_MOTION_M / 2)
 
 
-def are_placed(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
-    """Return True if the rays of sweeps begin at their poses (n,4,4): both are in the world.
+def rays_begin_at_poses(sweeps: Sequence[Sweep], T_world_lidar: Float) -> bool:
+    """Return True if the rays of raw sweeps begin at the poses of the sweeps.
 
-    The poses must then not be applied again. Fewer returns lie behind others seen from the pose
-    than seen from positions around it at the same height, and than seen from the origin. Two
-    sweeps decide: those whose poses are farthest from the origin, if more than 4 m away, where no
-    scanner is mounted.
+    The points are then in the world frame, and the poses (n,4,4) must not be applied again. The two
+    sweeps whose poses are farthest from the scanner's origin decide. A pose must be over 4 m away,
+    where no scanner is mounted. From this position clearly fewer returns must be occluded than from
+    the origin and from positions around.
     """
     positions = T_world_lidar[:, :3, 3]
     origins = np.stack([sweep.origin_m(0) for sweep in sweeps])
     distance_m = np.linalg.norm(positions - origins, axis=1)
-    for i in np.argsort(distance_m, kind="stable")[-2:]:
-        if distance_m[i] <= _STEP_M:
-            return False
-        others = [origins[i], *_positions_around(positions[i], _STEP_M, 4)]
-        lowest_share = min(_share_behind(sweeps[i].points, other) for other in others)
-        if _share_behind(sweeps[i].points, positions[i]) >= _MAX_OCCLUDED_RATIO * lowest_share:
-            return False
-    return True
+    farthest_two = np.argsort(distance_m, kind="stable")[-2:]
+    return all(
+        distance_m[i] > _STEP_M and _rays_begin_at(positions[i], sweeps[i].points, origins[i])
+        for i in farthest_two
+    )
+
+
+def _rays_begin_at(position: Float, points: Float, origin: Float) -> bool:
+    """Return True if fewer points (N,3) are occluded from the position (3,) than from others."""
+    others = [origin, *_positions_around(position, _STEP_M, 4)]
+    lowest_share = min(_share_behind(points, other) for other in others)
+    position_share = _share_behind(points, position)
+    return position_share < _MAX_OCCLUDED_RATIO * lowest_share
 
 
 def way_in_map(first: Sweep, last: Sweep) -> float:
-    """Return the distance (m) between the positions from which two raw sweeps were measured.
+    """Return the distance in metres between the positions from which two raw sweeps were measured.
 
-    It is 0 for sweeps in their scanner's own frame. Sweeps between which odometry finds no motion
-    are in the frame of a map if their rays begin apart.
+    It is 0 for sweeps in their scanner's own frame. Distances up to 1 m count as 0. Sweeps between
+    which odometry finds no motion are in the frame of a map if their rays begin apart.
     """
     start = _search_start(last)
     position_last = _find_scanner(last, start)
@@ -211,21 +222,22 @@ def _share_behind(points: Float, origin: Float) -> float:
     cell = _cell_numbers(directions / np.radians(0.4))
     nearest_m = np.full(int(cell.max()) + 1, np.inf)
     np.minimum.at(nearest_m, cell, range_m)
+    # At a low angle the returns of one surface in a cell differ in range, hence the wide margin.
     return float(np.mean(range_m > 1.15 * nearest_m[cell] + 1.0))
 
 
 def _find_scanner(sweep: Sweep, start: Float) -> Float:
     """Return the (3,) position, level with ``start`` (3,), from which a sweep was measured."""
-    # A descent in steps of 4 m to 0.5 m. A position counts only if clearly fewer returns are
-    # occluded there than at the start. Silhouettes split beams, hence up to 1 % of the returns seem
-    # occluded from the scanner itself.
+    # A descent in steps of 4 m to 0.5 m. The result counts only if clearly fewer returns are
+    # occluded from it than from the start. Silhouettes split beams, hence up to 1 % of the returns
+    # seem occluded from the scanner itself.
     points = sweep.points[::2]
     start_share = lowest_share = _share_behind(points, start)
     if start_share < 0.01:
         return start
     best_position = start
     for step_m in _STEP_M * 0.5 ** np.arange(4):
-        for _ in range(20):
+        for _ in range(20):  # limits the time
             positions = _positions_around(best_position, step_m, 8)
             shares = [_share_behind(points, position) for position in positions]
             if min(shares) >= lowest_share:
@@ -242,7 +254,7 @@ def _positions_around(position: Float, step_m: float, num: int) -> Float:
 
 
 def _search_start(sweep: Sweep) -> Float:
-    """Return the origin (3,) of a sweep, raised to a car's roof if it lies on the ground."""
+    """Return the origin (3,) of a sweep, raised to a car's roof if the origin is on the ground."""
     origin = sweep.origin_m(0)
     is_near = np.hypot(*(sweep.points - origin)[:, :2].T) < 30.0
     if not is_near.any():

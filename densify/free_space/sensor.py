@@ -35,9 +35,9 @@ _A1, _A3, _A5, _A7, _A9 = (
 
 @inlined
 def azimuth_of(x, y):  # type: ignore[no-untyped-def]
-    """Return the azimuth of (x, y) in radians, positive to the left."""
-    # The series is faster than the system's arctan2, and the same with every version of it.
-    # It holds up to 45 degrees; symmetries give the other octants.
+    """Return the azimuth of (x, y) in radians, -pi to pi, positive to the left."""
+    # The series is faster than the system's arctan2, and does not change with the system's version.
+    # The series holds up to 45 degrees. Symmetries give the other octants.
     ax, ay = abs(x), abs(y)
     is_steep = ay > ax
     ratio = ax / ay if is_steep else (ay / ax if ax > ZERO else ZERO)
@@ -113,7 +113,7 @@ class AimedRays(NamedTuple):
 
 
 def aim_rays(registered: RegisteredSweep, lidar: int) -> AimedRays:
-    """Return the rays of scanner number ``lidar``, each as it left at its own firing time."""
+    """Return the rays of scanner number ``lidar``, each in its frame at the ray's firing time."""
     sweep = registered.sweep
     rows = np.flatnonzero(sweep.lidar == lidar)
     offset_s = np.zeros(len(rows), np.float32)
@@ -144,7 +144,7 @@ class RayTable(NamedTuple):
     elevation_gap_rad: Float32
 
     def at(self, azimuth: NDArray[np.floating], elevation: NDArray[np.floating]) -> Float:
-        """Return the (N,2) gaps in azimuth and in elevation at (N,) directions, in radians."""
+        """Return the gaps (N,2) in azimuth and in elevation at N directions, all in radians."""
         num_rows, num_columns = self.elevation_gap_rad.shape
         row = np.clip((elevation - self.low_rad) / self.bin_rad, 0, num_rows - 1).astype(np.int64)
         column = ((azimuth + np.pi) * (num_columns / (2 * np.pi))).astype(np.int64) % num_columns
@@ -188,11 +188,11 @@ class SensorModel(Layout):
 
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep], lidar: int) -> SensorModel:
-        """Return the scanner with number ``lidar``, measured in up to three deskewed sweeps."""
+        """Return the model of scanner number ``lidar``, measured in up to three deskewed sweeps."""
         with_returns = [
             registered for registered in sweeps if (registered.sweep.lidar == lidar).any()
         ]
-        # The middle sweep of each third of them
+        # The middle sweep of each third of the sweeps with returns, for different surroundings
         middles = (np.arange(3) + 0.5) * len(with_returns) / 3
         sampled = [with_returns[index] for index in np.unique(middles.astype(int))]
         rays_of_sweep = [aim_rays(registered, lidar) for registered in sampled]
@@ -208,7 +208,7 @@ class SensorModel(Layout):
 
     @property
     def grid(self) -> RayGrid:
-        """The grid: a row for each ring or line, or square cells for unordered rays."""
+        """The grid of directions: a row for each ring or line, square cells for unordered rays."""
         low_rad, bin_rad, _, gap_rad = self.table
         if self.unordered:
             # A row for each bin, and cells as small as the closest rays. The densest 5 % of the
@@ -228,7 +228,7 @@ class SensorModel(Layout):
         return RayGrid(low_rad, bin_rad, row_of, num_rows, round(2 * np.pi / self.azimuth_step_rad))
 
     def sees(self, azimuth: Float, elevation: Float) -> Bool:
-        """Return (N,) True for directions, in radians, within the scanner's field of view."""
+        """Return the mask (N,) of directions, in radians, within the scanner's field of view."""
         right, left = self.azimuth_rad
         # Both angles are counted to the left from the right end.
         in_view = (azimuth - right) % (2 * np.pi) <= (left - right) % (2 * np.pi)
@@ -238,7 +238,12 @@ class SensorModel(Layout):
         return in_view & (elevation >= low) & (elevation <= high)
 
     def gap_m(self, points: Float) -> tuple[Float, Bool]:
-        """Return (N,) metres from points, lidar frame, to the next ring or ray; (N,) in view."""
+        """Return the gap from points (N,3), lidar frame, to the next ring, and which are in view.
+
+        Returns:
+            gap_m: (N,) metres at the point's range: spacing of rings or rays, plus a beam's width.
+            in_view: (N,) True for points within the field of view.
+        """
         ray = points - self.origin_m
         is_turned = not np.array_equal(self.axes, np.eye(3))
         x, y, z = (ray @ self.axes.T if is_turned else ray).T
@@ -257,7 +262,7 @@ class Sensors:
 
     @staticmethod
     def of(sweeps: Sequence[RegisteredSweep]) -> Sensors:
-        """Return all scanners, measured in the deskewed sweeps."""
+        """Return the models of all scanners that have returns in the deskewed sweeps."""
         numbers = np.unique([n for s in sweeps for n in np.unique(s.sweep.lidar)]).tolist()
         return Sensors({number: SensorModel.of(sweeps, number) for number in numbers})
 
@@ -270,7 +275,7 @@ class Sensors:
         return origins_m
 
     def gap_m(self, points: Float, lidar: NDArray[np.uint8]) -> Float:
-        """Return (N,) metres from points, lidar frame, to the next ring of their scanner (N,)."""
+        """Return gaps (N,) in m from points, lidar frame, to the next ring of their scanners."""
         gap_m = np.zeros(len(points))
         for number, model in self.models.items():
             rows = np.flatnonzero(lidar == number)
@@ -278,9 +283,9 @@ class Sensors:
         return gap_m
 
     def finest_gap_m(self, points: Float) -> Float:
-        """Return the least (N,) ring spacing of the scanners that have points (N,3) in view.
+        """Return the distances (N,) in m from points, lidar frame, to the next ring of any scanner.
 
-        Points, in the lidar frame, that no scanner has in view get the largest spacing.
+        Only scanners with the point in view count. A point out of view gets the largest distance.
         """
         gaps_m, in_view = zip(*(model.gap_m(points) for model in self.models.values()), strict=True)
         finest_m = np.where(in_view, gaps_m, np.inf).min(axis=0)
@@ -288,7 +293,7 @@ class Sensors:
 
 
 def _find_view(azimuth: Float32) -> tuple[float, float]:
-    """Return the right and the left end of the field of view, radians, of rays (N,)."""
+    """Return the azimuths (rad) of the right and left end of the field of view of rays (N,)."""
     angles = np.unique(azimuth).astype(np.float64)
     gap_rad = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest = int(np.argmax(gap_rad))
@@ -299,12 +304,12 @@ def _find_view(azimuth: Float32) -> tuple[float, float]:
 
 
 def measure_layout(sweeps: Sequence[AimedRays]) -> Layout:
-    """Return the layout of one scanner, measured in its rays of a few sweeps.
+    """Return the layout of one scanner, measured in the rays of a few sweeps.
 
     Most returns of rings have one of a few elevations. Lasers that do not share an origin, as in
     KITTI's HDL-64E, mix their rings at close range, but their returns follow at even steps along
-    the azimuth: lines. Scanners with neither are unordered. Fewer than 200 returns give the
-    default, lines with the spacing of a 64-beam scanner.
+    the azimuth: lines. A scanner without rings and lines is unordered. Fewer than 200 returns give
+    the default, lines with the spacing of a 64-beam scanner.
     """
     if sum(len(rays.azimuth) for rays in sweeps) < FEW_POINTS:
         gaps_rad = (np.full((1, 1), gap_rad, np.float32) for gap_rad in _DEFAULT_RAD)
@@ -317,6 +322,7 @@ def measure_layout(sweeps: Sequence[AimedRays]) -> Layout:
         return Layout(rings, False, step_rad, _table_of_rings(rings, step_rad))
 
     step_rad, even_share = np.median([_even_step(rays) for rays in sampled], axis=0).tolist()
+    # More than half of the rays of a spinning scanner are spaced evenly, of scattered rays a fifth.
     if even_share >= 0.5 and fires_by_azimuth(sampled[0]):
         return Layout(None, False, step_rad, _table_of_lines(sweeps, step_rad))
 
@@ -326,21 +332,29 @@ def measure_layout(sweeps: Sequence[AimedRays]) -> Layout:
 
 
 def find_rings(elevation: Float32) -> Float | None:
-    """Return the (K,) ascending elevations of the rings, None if the returns are not on rings."""
+    """Return the elevations of a scanner's rings, or None if the returns are not on rings.
+
+    Rings are peaks in the number of returns by elevation. They are accepted if 80 % of the returns
+    are closer to a ring than a fifth of the ring spacing. ``elevation`` (N,) of the returns and the
+    result (K,), ascending, are in radians.
+    """
     # The last bin but one holds the zenith; one more is spare for rounding.
     num_bins = int(np.pi / _RING_BIN_RAD) + 2
     bin_of_return = ((elevation + 0.5 * np.pi) / _RING_BIN_RAD).astype(np.int64)
     num_in_bin = np.bincount(bin_of_return, minlength=num_bins).astype(float)
     peaks = _find_peaks(ndimage.gaussian_filter1d(num_in_bin, 1.0))
+    # Fewer than three peaks have no pattern. Peaks of fewer than 24 returns on average are noise.
     if not 3 <= len(peaks) <= len(elevation) / _MIN_NUM:
         return None
 
-    # the middle of each peak's bin
+    # The middle of each peak's bin
     rings: Float = (peaks + 0.5) * _RING_BIN_RAD - 0.5 * np.pi
     ring = _nearest_ring(rings, elevation)
     is_close = np.abs(elevation - rings[ring]) < _EVEN * np.gradient(rings)[ring]
+    # Of elevations that are spread evenly, twice `_EVEN`, 40 %, are close by chance.
     if is_close.mean() < 0.8:
         return None
+    # The middle of a bin may be half a bin off. The mean of a ring's returns is more exact.
     sum_rad = np.bincount(ring[is_close], elevation[is_close].astype(float), len(rings))
     return sum_rad / np.bincount(ring[is_close], minlength=len(rings))
 
@@ -351,7 +365,7 @@ def _nearest_ring(rings: Float, elevation: Float32) -> Int:
 
 
 def _find_peaks(counts: Float) -> Int:
-    """Return the indices of maxima (ascending) with a valley of half their height between them."""
+    """Return the ascending indices of maxima that are separated by valleys of half their height."""
     peaks = []
     extreme = 0  # index of the highest count of this rise, or of the lowest of this fall
     is_rising = True
@@ -377,14 +391,14 @@ def fires_by_azimuth(rays: AimedRays) -> bool:
     num_rays = np.bincount(column)
     mean_s = np.bincount(column, rays.offset_s) / np.maximum(num_rays, 1)
     sum_squares = np.bincount(column, (rays.offset_s - mean_s[column]) ** 2)
-    # Fewer rays do not show the spread of a column's firing times.
+    # Fewer than five rays do not show the spread of a column's firing times.
     spread_s = np.sqrt(sum_squares / np.maximum(num_rays, 1))[num_rays >= 5]
-    # Most columns decide: at the seam between two turns a column has two times.
+    # 0.03 of a turn are 11 degrees. Most columns decide: a column at the seam has two times.
     return not len(spread_s) or bool(np.mean(spread_s < 0.03 * duration_s) > 0.5)
 
 
 def _select_sectors(rays: AimedRays) -> AimedRays:
-    """Return every fourth sector of many rays, which is enough to measure a layout."""
+    """Return every fourth sector if the rays are many: enough rays to measure a layout."""
     if len(rays.azimuth) > 15_000:
         is_sampled = np.floor(rays.azimuth / np.deg2rad(5.0)) % 4 == 0
         if is_sampled.mean() > 0.1:  # a narrow view may miss these sectors
@@ -393,12 +407,12 @@ def _select_sectors(rays: AimedRays) -> AimedRays:
 
 
 def _sort_in_groups(group: NDArray[Any], angle: Float32) -> Float:
-    """Return the angles in ascending order, each shifted by its group's number of `_APART_RAD`."""
+    """Return ascending angles, each shifted by `_APART_RAD` times the number of its group."""
     return np.sort(group * _APART_RAD + angle.astype(np.float64))
 
 
 def _gaps_in_groups(group: NDArray[Any], angle: Float32, min_rad: float) -> Float:
-    """Return the differences above a least one between neighbouring angles of the same group."""
+    """Return the gaps above ``min_rad`` between neighbouring angles of the same group."""
     gap_rad: Float = np.diff(_sort_in_groups(group, angle))
     return gap_rad[(gap_rad > min_rad) & (gap_rad < 2 * np.pi)]  # larger gaps are between groups
 
@@ -412,13 +426,12 @@ def _step_on_rings(rays: AimedRays, rings: Float) -> float:
 
 
 def _even_step(rays: AimedRays) -> tuple[float, float]:
-    """Return the median azimuth gap (rad) at about equal elevation, and the share close to it."""
+    """Return the median azimuth gap (rad) at about equal elevation, and the share of even gaps."""
     band = np.floor(rays.elevation / np.deg2rad(0.1))
     gap_rad = _gaps_in_groups(band, rays.azimuth, _MIN_GAP_RAD)
     if not len(gap_rad):
         return _DEFAULT_RAD[0], 0.0
     usual_rad = float(np.median(gap_rad))
-    # The share is more than half for a spinning scanner, and a fifth for scattered returns.
     return usual_rad, float(np.mean(np.abs(gap_rad - usual_rad) < _EVEN * usual_rad))
 
 
@@ -449,20 +462,20 @@ def _table_of_rings(rings: Float, step_rad: float) -> RayTable:
 
 def _table_of_lines(sweeps: Sequence[AimedRays], step_rad: float) -> RayTable:
     """Return the table of median elevation differences within sectors of 1 degree, by elevation."""
-    sizes_rad, middles_rad = [], []  # of the gaps between neighbouring lines
+    sizes_rad, middles_rad = [], []  # of the gaps between neighbouring lines, for each sweep
     for rays in sweeps:
         # Each elevation is shifted by a multiple of `_APART_RAD`, the number of its sector.
         shifted_rad = _sort_in_groups(np.floor(rays.azimuth / _CELL_RAD), rays.elevation)
         gap_rad = np.diff(shifted_rad)
-        # A wide gap is due to missing returns or lies between two sectors. A gap below half a step
-        # of azimuth lies within one line.
+        # A gap above 4 degrees is due to missing returns or lies between two sectors. A gap below
+        # half a step of azimuth lies within one line.
         is_gap = (gap_rad < np.deg2rad(4.0)) & (gap_rad > max(step_rad / 2, _MIN_GAP_RAD))
         middle_rad = shifted_rad[:-1][is_gap] + gap_rad[is_gap] / 2
-        # Elevations are small against the shift. The nearest multiple of it is therefore the shift.
+        # Elevations are small, so the nearest multiple of `_APART_RAD` is the shift of the sector.
         middles_rad.append(middle_rad - _APART_RAD * np.rint(middle_rad / _APART_RAD))
         sizes_rad.append(gap_rad[is_gap])
 
-    # one bin below the lowest ray and one above the highest, with their own gaps unknown
+    # The table has one bin below the lowest ray and one above the highest. Both have no gaps.
     low_rad = float(min(rays.elevation.min() for rays in sweeps)) - _LINE_BIN_RAD
     high_rad = float(max(rays.elevation.max() for rays in sweeps)) + _LINE_BIN_RAD
     num_bins = int((high_rad - low_rad) / _LINE_BIN_RAD) + 2
@@ -487,7 +500,7 @@ def _table_of_density(sweeps: Sequence[AimedRays]) -> RayTable:
         column = ((rays.azimuth + np.pi) / _CELL_RAD).astype(np.int64) % num_columns
         np.add.at(num_returns, (row, column), 1)
 
-    # Single empty cells between others are in view, too.
+    # Single empty cells between filled cells are in view, too.
     is_filled = num_returns > 0
     in_view = ndimage.binary_closing(np.pad(is_filled, 1))[1:-1, 1:-1] | is_filled
     elevation = _bin_middles(low_rad, _CELL_RAD, num_rows)
@@ -503,7 +516,7 @@ def _table_of_density(sweeps: Sequence[AimedRays]) -> RayTable:
         window_density = num_in_window / np.maximum(window_sr, 1e-12)
         density = np.where(is_enough & (window_sr > 0), window_density, density)
 
-    # Cells without a density take the spacing of the nearest cell with one.
+    # A cell without a density takes the spacing of the nearest cell with a density.
     has_density = in_view & (density > 0)
     spacing_rad = np.sqrt(len(sweeps) / np.where(has_density, density, 1.0))
     nearest_cell = ndimage.distance_transform_edt(~has_density, return_indices=True)[1]
