@@ -22,14 +22,14 @@ _MOST_DIGITS = 18
 
 
 def natural(text: str) -> int:
-    """Parse a whole number from 0 up; raise ArgumentTypeError for other texts."""
+    """Parse a whole number from 0 up. Raise ArgumentTypeError for other texts."""
     if not _are_digits(text):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
 
 
 def positive(text: str) -> float:
-    """Parse a finite number above 0; raise ArgumentTypeError for other texts."""
+    """Parse a finite number above 0. Raise ArgumentTypeError for other texts."""
     try:
         number = float(text)
     except ValueError:
@@ -64,7 +64,7 @@ def all_or_range(text: str) -> range | None:
 
 
 def shard(text: str) -> tuple[int, int]:
-    """Parse ``i/n``, part i of n with i from 1 to n; raise ArgumentTypeError for other texts."""
+    """Parse ``i/n``, part i of n with i from 1 to n. Raise ArgumentTypeError for other texts."""
     part, slash, count = text.partition("/")
     if slash and _are_digits(part, count) and 1 <= int(part) <= int(count):
         return int(part), int(count)
@@ -141,7 +141,7 @@ def recordings_of(options: argparse.Namespace, default: str = "street") -> list[
 
 
 def recording_of(options: argparse.Namespace) -> str:
-    """Return the specification of a command's only recording; raise InputError for several."""
+    """Return the specification of a command's only recording. Raise InputError for several."""
     specs = recordings_of(options)
     if len(specs) > 1:
         raise InputError(f"got {len(specs)} recordings, {', '.join(specs)}; expected one")

@@ -63,7 +63,7 @@ def answer_info(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify doctor``: yield the findings; raise InputError if something is wrong."""
+    """Answer ``densify doctor``: yield the findings. Raise InputError if something is wrong."""
     config, spec = config_of(options), recording_of(options)
     sequence = open_sequence(spec)
     if options.write is not None:

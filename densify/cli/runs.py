@@ -197,7 +197,7 @@ def _of_pixels(measured: float | None, filled: float | None) -> str:
 
 
 def _beside_icp(result: Result, *path: str) -> str:
-    """Return a share as text, with the share of rigid accumulation in brackets; "" for none."""
+    """Return a share as text, with the share of rigid accumulation in brackets, or "" for none."""
     share = look_up(result.metrics, *path)
     rigid = result.baselines.get("icp")
     by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
@@ -251,7 +251,7 @@ def _comparison(results: Mapping[str, Result]) -> str:
 
 
 def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify export``: write a finished run in another format; yield what is left."""
+    """Answer ``densify export``: write a finished run in another format, and yield what is left."""
     exported = export_run(
         options.run,
         options.to,

@@ -53,7 +53,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         split: Literal["train", "val"] | None = None,
         max_outliers: float | None = None,
     ) -> None:
-        """Find the finished key sweeps of a training set; raise InputError if there are none.
+        """Find the finished key sweeps of a training set. Raise InputError if there are none.
 
         Args:
             root: Folder of the training set, ``--out`` of `densify dataset`.

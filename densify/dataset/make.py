@@ -155,7 +155,7 @@ def make_dataset(
 
 
 def status(out: Path) -> Summary:
-    """Return the progress of a training set from its files; raise InputError if it is none."""
+    """Return the progress of a training set from its files. Raise InputError if it is none."""
     table = read_plan(out)
     if table is None:
         raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
@@ -239,7 +239,7 @@ def _record(
     num_keys: int,
     report: Callable[[Summary], None] | None,
 ) -> Summary:
-    """Record and report the outcomes of `call_all` as they come; return the final progress."""
+    """Record and report the outcomes of `call_all` as they come, and return the final progress."""
     start_s = time.monotonic()
     summary = Summary(records, num_keys)
     try:
@@ -367,7 +367,7 @@ def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
 
 
 def _densified(job: Job, key: int) -> KeyRecord:
-    """Densify and write one key, unless its scores are beyond a limit; return its record."""
+    """Densify and write one key, unless its scores are beyond a limit, and return its record."""
     recipe = job.recipe
     recording, cache = _opened(job)
     is_tree = recipe.layout == "kitti-depth"
@@ -425,7 +425,7 @@ def _write(job: Job, results: Mapping[str, Result]) -> list[Path]:
 
 @lru_cache(maxsize=1)
 def _opened(job: Job) -> tuple[Recording, Cache]:
-    """Return a job's recording with its cache; raise ComputationError for another version."""
+    """Return a job's recording with its cache. Raise ComputationError for another version."""
     if job.version != __version__:
         raise ComputationError(
             f"the worker on {platform.node()} has densify {__version__}, the command has "

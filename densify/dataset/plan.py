@@ -180,7 +180,7 @@ def choose_spread(drives: Sequence[Drive], num_keys: int) -> list[Drive]:
 
 
 def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:
-    """Return the chosen frame numbers of a recording; raise InputError if there are none."""
+    """Return the chosen frame numbers of a recording. Raise InputError if there are none."""
     if keys is None:
         return tuple(sequence.frames)
     first, last = min(sequence.frames), max(sequence.frames)

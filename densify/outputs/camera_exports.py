@@ -55,7 +55,7 @@ class Picture(NamedTuple):
         return metres(self.run.maps(self.map)["depth"])
 
     def rectified_m(self, to: str) -> Float32:
-        """Return `measured_m`; raise InputError, for format ``to``, if the image has distortion."""
+        """Return `measured_m`. Raise InputError, for format ``to``, if the image has distortion."""
         depth_m = self.measured_m()
         if not self.camera.is_rectified:
             raise InputError(

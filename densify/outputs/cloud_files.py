@@ -137,7 +137,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 
 def read_cloud(path: Path) -> StoredCloud:
-    """Return the cloud in a file that `write_cloud` wrote; raise InputError for other files."""
+    """Return the cloud in a file that `write_cloud` wrote. Raise InputError for other files."""
     las = read_las(path)
     if missing := _DIMENSIONS - set(las.point_format.dimension_names):
         raise InputError(

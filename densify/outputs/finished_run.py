@@ -297,7 +297,7 @@ def map_names(*folders: Path) -> list[str]:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Return the content of scene.json; raise InputError if it is damaged."""
+    """Return the content of scene.json. Raise InputError if it is damaged."""
     with _damage_named(path):
         table = read_json(path)
         T_key_lidar = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
@@ -309,7 +309,7 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Return the tracks of moving objects in movers.json; raise InputError if it is damaged."""
+    """Return the tracks of moving objects in movers.json. Raise InputError if it is damaged."""
     with _damage_named(path):
         table = read_json(path)
         tracks = [_track(entry) for entry in table["objects"]]
@@ -365,7 +365,7 @@ def _track(entry: Mapping[str, Any]) -> ObjectTrack:
 
 
 def _array(value: Any, *shape: int) -> Float:
-    """Return an array of finite numbers of this shape; raise ValueError for any other."""
+    """Return an array of finite numbers of this shape. Raise ValueError for any other."""
     array = np.array(value, np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"expected {' x '.join(map(str, shape))} numbers")
@@ -397,7 +397,7 @@ def export_run(
     cameras: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> Export:
-    """Write a finished run in another format, from its files alone; return what was written.
+    """Write a finished run in another format, from its files alone, and return what was written.
 
     Args:
         run: Folder of one key sweep, or of several for formats of whole drives.

@@ -82,7 +82,7 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write compare.json, compare.png and the last method's ``compare/``; return the paths.
+    """Write compare.json, compare.png and the last method's ``compare/``, and return the paths.
 
     ``results`` has method -> result. The other arguments are those of `write_result`.
     """

@@ -70,7 +70,7 @@ class KeyFiles:
 
     @staticmethod
     def of_run(folder: Path) -> KeyFiles:
-        """Return the files of a run; raise InputError without a readable run.yaml."""
+        """Return the files of a run. Raise InputError without a readable run.yaml."""
         files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
         metrics = _mapping(files.read(read_json, "metrics.json"))
         method = str(files.about.get("method", "run"))

@@ -251,7 +251,7 @@ def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def show_in_rerun(runs: Sequence[FinishedRun]) -> None:
-    """Show the runs in rerun's viewer, which stays open; raise InputError without the package."""
+    """Show the runs in rerun's viewer, which stays open. Raise InputError without the package."""
     with _rerun_stream(runs) as stream:
         stream.spawn()
         _log_to_rerun(stream, runs)

@@ -359,7 +359,7 @@ class Rectangles(NamedTuple):
         return Rectangles(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 
     def rows(self, rows: Int | None) -> Rectangles:
-        """Return the rectangles with these indices along the first axis; None adds an axis."""
+        """Return the rectangles with these indices along the first axis, or None adds an axis."""
         return Rectangles(*(column[rows] for column in self))
 
 
