@@ -40,18 +40,21 @@ def positive(text: str) -> float:
 
 
 def words(text: str) -> list[str]:
-    """Parse words separated by commas."""
+    """Parse words separated by commas, without empty ones."""
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def key_range(text: str, alternative: str = "") -> range:
-    """Parse ``A:B[:S]``, frames A to B - 1 by S (1); the message also names the ``alternative``."""
+    """Parse ``A:B[:S]`` as the range of frames A to B - 1 by S, which is 1 if left out.
+
+    Raise ArgumentTypeError, whose message also names the ``alternative``, for other texts.
+    """
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
-        first, end = int(numbers[0]), int(numbers[1])
+        begin, end = int(numbers[0]), int(numbers[1])
         step = int(numbers[2]) if len(numbers) == 3 else 1
-        if first < end and step > 0:
-            return range(first, end, step)
+        if begin < end and step > 0:
+            return range(begin, end, step)
     raise argparse.ArgumentTypeError(
         f"got {text!r}, expected {alternative}A:B[:S] with A < B, such as 0:100:5 for frames 0, 5 "
         f"to 95"
@@ -178,7 +181,7 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = "", option: str = 
 
 
 def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frame numbers in the range ``--keys``, all for None; InputError for no frame."""
+    """Return the frame numbers in the range ``--keys``, all for None, but at least one of them."""
     from densify.readers.timeline import format_frames
 
     frames = [frame for frame in sequence.frames if keys is None or frame in keys]
@@ -191,7 +194,7 @@ def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
 
 
 def raise_failures(failures: Mapping[int, Exception], num: int, unit: str) -> None:
-    """Raise ComputationError, with reasons by frame, if some of ``num`` keys or sweeps failed."""
+    """Raise ComputationError, with reasons by frame, if any of ``num`` keys or sweeps failed."""
     if failures:
         reasons = "; ".join(f"{unit} {number}: {error}" for number, error in failures.items())
         raise ComputationError(f"{len(failures)} of {num} {unit}s not made: {reasons}")

@@ -130,16 +130,13 @@ def pinhole(
 def chosen_scene(
     reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
 ) -> str:
-    """Return the name of the requested scene, or of the only scene.
+    """Return the name of the requested scene, or of the only scene. Else raise InputError.
 
     Args:
         reader, path: Name of the reader and path of the recordings, for messages.
         scene: Name of the requested scene, None for the only scene.
         names: Names of the existing scenes.
         none: Message of the InputError if there are no scenes.
-
-    Raises:
-        InputError: The requested scene is unknown, or no scene or several exist.
     """
     if not names:
         raise InputError(f"{path}: {none}")

@@ -63,10 +63,7 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return arrays of a .npz file by name, all of them if ``names`` is None.
-
-    Raise InputError if the file is damaged, or if the arrays take more than ``most_bytes``.
-    """
+    """Return arrays of a .npz by name, all for None. Raise InputError if over ``most_bytes``."""
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -99,11 +96,7 @@ def _array(data: bytes) -> NDArray[Any]:
 
 
 def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
-    """Return the pixels of a PNG or JPEG file: (H,W,3) uint8 blue, green, red.
-
-    ``as_stored`` keeps the file's data type and channels, such as (H,W) uint16. Raise InputError if
-    the file is damaged.
-    """
+    """Return a PNG or JPEG file's (H,W,3) uint8 blue, green, red, or its pixels ``as_stored``."""
     return decode_image(read_bytes(path), path, as_stored)
 
 

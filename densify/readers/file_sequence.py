@@ -44,30 +44,18 @@ class FileSequence(ABC):
 
     def __init__(
         self,
-        name: str,
-        where: Path,
-        frames: Sequence[int],
-        cameras: Mapping[str, Camera] | None = None,
+        name: str,  # name of the recording, for people and outputs
+        where: Path,  # path of the recording, for messages
+        frames: Sequence[int],  # numbers of the existing sweeps, ascending
+        cameras: Mapping[str, Camera] | None = None,  # cameras by name, None for none
+        # Exposure time of each existing image in ns, by camera and image number
         exposed_ns: Mapping[str, Mapping[int, int]] | None = None,
-        truth: Truth | None = None,
-        files: Mapping[int, Path] | None = None,
+        truth: Truth | None = None,  # ground truth of a simulated recording
+        files: Mapping[int, Path] | None = None,  # file of each sweep, None if sweeps share files
+        # PNG or JPEG file of each image, by camera and number. None if the reader has an `_image`
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
-        """Store what the reader found.
-
-        Args:
-            name: Name of the recording, for people and outputs.
-            where: Path of the recording, for messages.
-            frames: Numbers of the existing sweeps, ascending.
-            cameras: Cameras by name.
-            exposed_ns: Exposure time of each existing image, by camera and image number.
-            truth: Ground truth of a simulated recording.
-            files: File of each sweep, by frame. None if sweeps share files.
-            images: File of each image, by camera and number. None if a reader overrides `_image`.
-
-        Raises:
-            InputError: All files of sweeps are empty.
-        """
+        """Store what the reader found. Raise InputError if all files of sweeps are empty."""
         self.name = name
         self.where = where
         self.frames: Sequence[int] = frames

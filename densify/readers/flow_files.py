@@ -75,7 +75,7 @@ def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowF
 
 
 def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Columns:
-    """Return a flow file's arrays for the N points of sweep ``frame``, zeros for missing points."""
+    """Return a flow file's arrays for a sweep's N points, flow 0 and object -1 for missing ones."""
     path = folder / f"{frame:06d}_{target:06d}.npz"
     sweep = stretch[frame].sweep
     row = sweep.row

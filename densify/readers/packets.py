@@ -123,11 +123,7 @@ class Velodyne(FileSequence):
 
 
 def _find_packets(path: Path) -> Int:
-    """Return the Velodyne packets of a capture as (4,P).
-
-    The rows are the offset in the file, the capture time (ns), the azimuth (0.01 degrees) and the
-    packets' clock (us).
-    """
+    """Return the packets' (4,P) file offset, capture time (ns), azimuth (0.01 deg), clock (us)."""
     packets = []
     with open_file(path) as file:
         magic = file.read(24)[:4]

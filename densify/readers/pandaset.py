@@ -170,8 +170,8 @@ def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
     num_entries = min(len(stamps_ns), len(T))
     if last >= num_entries:
         raise InputError(
-            f"{folder}: got {num_entries} entries in poses.json and timestamps.json, expected one for each "
-            f"file up to number {last}"
+            f"{folder}: got {num_entries} entries in poses.json and timestamps.json, expected one "
+            f"for each file up to number {last}"
         )
     return stamps_ns[:num_entries], np.stack(T[:num_entries])
 

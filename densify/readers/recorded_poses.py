@@ -64,7 +64,7 @@ class PoseTrack:
         return poses.interpolate(self.T_world_ego[before], self.T_world_ego[after], fraction)
 
     def undo_compensation(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Return points (N,3) as measured: in metres, the vehicle frame at each point's firing time.
+        """Return points (N,3) as measured, in the vehicle frame at each point's own firing time.
 
         Many data sets store a sweep as if measured at one time, which smears moving objects and
         bends rings.

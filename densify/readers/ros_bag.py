@@ -268,7 +268,7 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
 
 
 def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Return a cloud message's single-number fields by name, (N,) as stored, or raise InputError."""
+    """Return the single numbers of a cloud message by name, (N,) as stored, or raise InputError."""
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
         table = np.array(rows, list(_LIVOX.items()))

@@ -149,7 +149,7 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """Return the times in a file's lines, dates or numbers of ``unit`` ("": detect the unit)."""
+        """Return the times of a file's lines: dates, or numbers of ``unit``, "" to detect it."""
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         time_column = table.column(TIME_COLUMNS)
         name_column = table.column(_FILE_COLUMNS)

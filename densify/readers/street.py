@@ -61,9 +61,7 @@ class Street:
         tilt_deg: float = 0.0,
         cameras: tuple[str, ...] = USUAL,
     ) -> None:
-        """Set up the street, whose sweeps and images are rendered on demand.
-
-        Values that are unknown or out of range raise InputError.
+        """Set up the street. Values that are unknown or out of range raise InputError.
 
         Args:
             preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the

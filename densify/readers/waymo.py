@@ -72,7 +72,7 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns (N,) by short name, whose ``kinds`` and ``where`` `read_arrow` explains."""
+        """Return columns (N,) by short name, with the arguments of `read_arrow`."""
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -226,7 +226,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the vehicle's frame, or None for a sweep without annotations."""
+        """Return a sweep's boxes in the vehicle's frame, or None without annotations for it."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 
