@@ -45,10 +45,7 @@ def words(text: str) -> list[str]:
 
 
 def key_range(text: str, alternative: str = "") -> range:
-    """Parse ``A:B[:S]`` as the range of frames A to B - 1 by S, which is 1 if left out.
-
-    Raise ArgumentTypeError, whose message also names the ``alternative``, for other texts.
-    """
+    """Parse ``A:B[:S]`` as frames A to B - 1 by S, else 1. Errors also name the ``alternative``."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
         begin, end = int(numbers[0]), int(numbers[1])
@@ -181,7 +178,7 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = "", option: str = 
 
 
 def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frame numbers in the range ``--keys``, all for None, but at least one of them."""
+    """Return the frame numbers within ``--keys``, all for None. Raise InputError if none fits."""
     from densify.readers.timeline import format_frames
 
     frames = [frame for frame in sequence.frames if keys is None or frame in keys]

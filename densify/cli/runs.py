@@ -280,7 +280,7 @@ def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify view``: show finished runs in a viewer until the user closes the window."""
+    """Answer ``densify view``: show finished runs until the user closes the viewer."""
     runs = finished_runs(options.dir, Thresholds(cameras=options.camera))
     viewers = {"rerun": show_in_rerun, "open3d": show_in_open3d}
     viewers[vars(options)["with"]](runs)
@@ -295,9 +295,9 @@ def answer_evaluate(options: argparse.Namespace) -> Iterator[Answer]:
         scores = evaluate(pairs, options.focal_px, options.baseline_m, progress)
     num_images, density = scores["num_images"], scores["density"]
     lines = [
-        f"{num_images:,} image{'s' if num_images != 1 else ''}: predicted "
-        f"{percent(density['predicted'])} of the pixels, truth {percent(density['truth'])}; outliers with fx "
-        f"{scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
+        f"{num_images:,} image{'s' * (num_images != 1)}: predicted "
+        f"{percent(density['predicted'])} of the pixels, truth {percent(density['truth'])}; "
+        f"outliers with fx {scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
     ]
     for name, title in _UNPAIRED.items():
         if paths := scores[name]:

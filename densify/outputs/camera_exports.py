@@ -123,7 +123,7 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a scene in map-anything's format, with depth in metres, 0 for no depth."""
+    """Write a scene in map-anything's format (data_processing/README.md), depth in m, 0: none."""
     pictures = _pictures(runs, flat=True)
     _write_jpegs(pictures, folder)
     frames = []
@@ -147,7 +147,7 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a training set in MoGe's format, with depth on a log scale, 0 for no depth."""
+    """Write a training set in MoGe's format (docs/train.md), depth on a log scale, 0 for none."""
     names = []
     for run in runs:
         for picture in _pictures([run], flat=True):

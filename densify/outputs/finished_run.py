@@ -126,7 +126,7 @@ class FinishedRun:
     """The folder of one densified key sweep. Files are read on demand and may raise InputError."""
 
     def __init__(self, folder: Path, thresholds: Thresholds = EVERYTHING) -> None:
-        """Open the folder of a run. Raise InputError if it has no valid run.yaml."""
+        """Open a run's folder to read within ``thresholds``. Raise InputError if it has no run."""
         path, problem = folder / "run.yaml", "no run.yaml in it"
         if (folder / "dataset.json").is_file():
             problem = (

@@ -69,8 +69,9 @@ def write_street(
             f"{street.name}: cannot be written as KITTI, whose points have neither a time nor a "
             f"scanner; choose a single scanner that spins: {', '.join(fit)}"
         )
-    for name in excerpt.cameras if is_kitti else ():
-        checks.camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
+    if is_kitti:  # KITTI's cameras alone have a place in its calibration file
+        for name in excerpt.cameras:
+            checks.camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
     folder, owned = (out / _DATE, _KITTI) if is_kitti else (out / "street", _FOLDER)
     for name in owned:
         if (folder / name).exists() and not overwrite:
@@ -93,7 +94,7 @@ class Excerpt:
     def of(
         cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
-        """Return the excerpt of these frames and cameras, None for all, after checks."""
+        """Return the excerpt of these frames and cameras (None: all), or raise InputError."""
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
             checks.camera_named(street.cameras, name, Path(street.name))

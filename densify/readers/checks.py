@@ -28,13 +28,12 @@ def numbered_files(
 ) -> dict[int, Path]:
     """Return the numbered files of a folder, such as ``0000000120.bin``, by ascending number.
 
+    Raise InputError if two files of one suffix have the same number.
+
     Args:
         folder: Folder to search without its subfolders, or one file. It may be missing.
         *suffixes: Accepted suffixes. Of files with the same number, the earliest suffix is taken.
         stem: Pattern of a whole name without suffix. The pattern's first group is the number.
-
-    Raises:
-        InputError: Two files of one suffix have the same number.
     """
     entries = [folder] if folder.is_file() else folder.glob("*")
     files = [

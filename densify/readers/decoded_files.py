@@ -96,7 +96,7 @@ def _array(data: bytes) -> NDArray[Any]:
 
 
 def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
-    """Return a PNG or JPEG file's (H,W,3) uint8 blue, green, red, or its pixels ``as_stored``."""
+    """Return a PNG or JPEG file's pixels: (H,W,3) uint8 blue, green, red, unless ``as_stored``."""
     return decode_image(read_bytes(path), path, as_stored)
 
 

@@ -87,7 +87,8 @@ def pair_depth_files(
     """Pair estimated PNG depth maps with true depth maps and with masks of moving objects.
 
     Two files are paired whatever their names. In folders the frames must agree, and the drive and
-    the camera too if all paths name them.
+    the camera too if all paths name them. Raise InputError if files are missing or ambiguous, or
+    none match.
 
     Args:
         predicted: File of an estimated map, or folder that is searched with its subfolders. Files
@@ -95,9 +96,6 @@ def pair_depth_files(
         truth: File or folder of true maps.
         mask: File or folder of masks, None for none.
         filled: True to pair densify's filled maps instead of its maps of measured pixels.
-
-    Raises:
-        InputError: Files are missing or ambiguous, or no files belong together.
     """
     estimated = _of_product(_depth_files(predicted, "PREDICTED"), predicted, filled)
     files = _depth_files(truth, "TRUTH")

@@ -104,7 +104,7 @@ class Drive(FileSequence):
     def __init__(
         self, name: str, where: Path, sweeps: Path, stamps: Stamps, images: Mapping[str, Path]
     ) -> None:
-        """Find the .bin files of the folder ``sweeps``, and images, whose folder is by camera."""
+        """Find the .bin files in the folder ``sweeps``, and images in the folder of each camera."""
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")

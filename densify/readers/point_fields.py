@@ -217,7 +217,7 @@ def find_times(
 
 
 def _unit_of(span_in_periods: float) -> str:
-    """Return the unit in which a sweep's span, over the period in ns, is a period, else ""."""
+    """Return the unit in which a span, over the period in ns, is 0.08 to 4 periods, else ""."""
     num_periods = {unit: span_in_periods * unit_ns for unit, unit_ns in UNIT_NS.items()}
     return next((unit for unit, num in num_periods.items() if _SHORTEST < num < _LONGEST), "")
 

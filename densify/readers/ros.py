@@ -49,7 +49,7 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 def open_recording(path: Path, scene: str | None) -> RosBag:
-    """Return a bag. ``scene`` names topics, as in ``points=/lidar&images=none``, None for all."""
+    """Return a bag. ``scene`` names topics to read: ``points=/lidar&images=none``, None: detect."""
     return RosBag(path, scene)
 
 

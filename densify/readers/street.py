@@ -133,7 +133,7 @@ class Street:
         return in_one_line(self)
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep in ns since 1970. Raise InputError without it."""
+        """Return the reference time of a sweep in nanoseconds since 1970."""
         self.check(frame)
         return self.simulator.stamp_ns(frame)
 

@@ -196,7 +196,7 @@ class Timeline:
 
 
 def _out_of_order(stamps_ns: Int) -> list[int]:
-    """Return the indices of stamps outside the longest ascending series, or [] if half are."""
+    """Return indices of stamps outside the longest ascending series, [] for half of all stamps."""
     if np.all(np.diff(stamps_ns) > 0):
         return []
     # Longest increasing subsequence by patience sorting: a stamp continues the longest series

@@ -187,7 +187,7 @@ def _whole_us(seconds: float) -> int:
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """Return the segment ``scene`` (CONTEXT) of a split's folder, or None for the only one."""
+    """Return the segment ``scene`` (CONTEXT) of a split's folder, the only segment for None."""
     names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
     example = "lidar/10017090168044687777_6380_000_6400_000.parquet"
     none = f"no segments; expected files such as {example}"

@@ -170,7 +170,7 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     material = world.triangles.material[triangle]
     direction = rays.direction[rows]
     range_m = hits.range_m[rows, None]
-    # Normals are turned towards the camera.
+    # Normals of triangles have either sign, and are turned towards the camera.
     normal = hits.normal[rows]
     facing = np.einsum("ni,ni->n", normal, direction)
     normal = np.where(facing[:, None] > 0, -normal, normal)
@@ -230,6 +230,7 @@ def _painted(world: World, triangle: Int, barycentric: Float32) -> Float:
     """Return the (N,3) colours of points on triangles: material, tint and texture."""
     uv = world.triangles.uv[triangle]
     material = world.triangles.material[triangle]
+    # position = (1 - b - c) uv_0 + b uv_1 + c uv_2, with the barycentric coordinates b and c
     weight_1, weight_2 = barycentric.astype(np.float64).T[:, :, None]
     position = uv[:, 0] * (1 - weight_1 - weight_2) + uv[:, 1] * weight_1 + uv[:, 2] * weight_2
     brightness = np.ones(len(material))

@@ -365,7 +365,7 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
     rays = Rays(origin.repeat(len(_SPOT), axis=0), spot.reshape(-1, 3), times.repeat(len(_SPOT)))
     hits = world.cast(rays, laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD)
 
-    # One echo for each pulse, and whether the receiver detects it
+    # One echo for each pulse, and whether the receiver detects the echo
     range_m, ray, is_edge = _strongest_echoes(hits, spot, rng)
     triangle = hits.triangle[ray]
     material, tint = world.triangles.material[triangle], world.triangles.mean_tint[triangle]

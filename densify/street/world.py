@@ -206,7 +206,8 @@ class World:
         self, body: int, origin: Float, direction: Float, number: Int, optics: Optics
     ) -> Hits:
         """Return the hits of rays with one body, in its frame. ``number`` (N,) are ray indices."""
-        # Distances are to the plane of the triangle, in double precision, also for absorbed rays.
+        # Embree finds the triangles in single precision. Distances to their planes are computed
+        # in double precision, also for absorbed rays.
         surfaces = self.triangles
         n = len(origin)
         hits = Hits(
