@@ -74,7 +74,7 @@ class _Score(NamedTuple):
     unit: str = "%"
 
     def of(self, record: KeyRecord) -> float | None:
-        """Return the score of a key in ``unit``, the mean over its cameras, or None if unknown."""
+        """Return the score of a key in ``unit``, the mean over its cameras; None if unknown."""
         if self.name == "seconds":
             return record.seconds
         values = record.values_of(self.name)
@@ -351,7 +351,7 @@ def _cells(values: Iterable[Any]) -> list[str]:
 def _table(
     heads: Iterable[str], rows: Iterable[Iterable[str]], attributes: Iterable[str] = repeat("")
 ) -> str:
-    """Return the rows of a table, whose cells are HTML, with its head, or "" without rows."""
+    """Return the rows of a table, whose cells are HTML, with its head; "" without rows."""
     body = [
         f"<tr{attribute}>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>"
         for row, attribute in zip(rows, attributes, strict=False)
@@ -389,7 +389,7 @@ def _shrink(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _small_image(drive: Drive, key: int, size_px: tuple[int, int]) -> Picture | None:
-    """Return the RGB image at a key sweep, resized to (width, height), or None if there is none."""
+    """Return the RGB image at a key sweep, resized to (width, height); None if there is none."""
     camera = drive.cameras[front_camera(drive)]
     try:
         sequence = _open(drive.data)
