@@ -65,13 +65,13 @@ def answer_bench_flow(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _recordings_folder(options: argparse.Namespace) -> Path | None:
-    """Return the folder of real recordings of ``--data``, or of the environment; None without."""
+    """Return the folder of real recordings of ``--data`` or the environment, else None."""
     named = os.environ.get("DENSIFY_TEST_DATA")
     return options.data or (Path(named) if named else None)
 
 
 def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify bench gate``: yield the verdicts of each group; store figures if asked."""
+    """Answer ``densify bench gate``: yield the verdicts of each group, store figures on demand."""
     kinds = gate.KINDS if options.only is None else options.only
     for kind in kinds:
         if kind not in gate.KINDS:
@@ -88,11 +88,11 @@ def answer_bench_gate(options: argparse.Namespace) -> Iterator[Answer]:
         )
         rows = []
         for verdict in verdicts(before, after, luck):
-            key, change = verdict.worst
+            worst_key, worst_change = verdict.worst
             cells = [f"{value:.4g}" for value in (verdict.before, verdict.now)]
             cells += [f"{value:+.4f}" for value in (verdict.change, verdict.error, verdict.luck)]
-            name, num_keys = verdict.figure, str(len(verdict.keys))
-            rows.append([name, num_keys, *cells, f"{key} {change:+.4f}", verdict.word])
+            cells += [f"{worst_key} {worst_change:+.4f}", verdict.word]
+            rows.append([verdict.figure, str(len(verdict.keys)), *cells])
         if rows:
             titles = [group, "keys", "before", "now", "change", "error", "luck", "worst", ""]
             yield Answer(aligned([titles, *rows]) + "\n")
@@ -121,7 +121,7 @@ def answer_bench_baselines(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _error_cells(errors: DepthErrors) -> list[str]:
-    """Return cells of a table; a share of few pixels is not shown."""
+    """Return the errors as cells of a table, without shares of too few pixels."""
     cells = [f"{errors.num_pixels:,}", percent(errors.coverage)]
     if errors.num_compared < LEAST_PIXELS or errors.mae_m is None:
         return [*cells, "–", "–", "–"]
@@ -155,7 +155,7 @@ def answer_bench_training(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _mean_cell(of_seeds: list[dict[str, Any]], test: str, part: str, error: str, form: str) -> str:
-    """Return the mean of an error over networks, and its standard error, as a cell."""
+    """Return a cell with the mean of an error over networks, and its standard error."""
     values = [value for of in of_seeds if (value := of[test][part][error]) is not None]
     mean, error_of_mean = mean_and_error(values)
     of_mean = "" if error_of_mean is None else f" ± {written(error_of_mean, form)}"

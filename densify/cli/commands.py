@@ -338,8 +338,8 @@ _GROUPS = {
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse a command line, None for this process's.
 
-    The options hold ``verb``, its name after that of its group, such as "bench flow", ``module``
-    with its function, and ``command``, the text of the command.
+    The options also hold ``verb``, such as "bench flow", the ``module`` that answers it, and
+    ``command``, the text of the command.
     """
     parser = command_line()
     texts = list(sys.argv[1:] if arguments is None else arguments)
@@ -359,7 +359,7 @@ def answers(options: argparse.Namespace) -> Iterable[Answer]:
 
 
 def command_line() -> argparse.ArgumentParser:
-    """Return the parser of all verbs."""
+    """Return the parser of all verbs, made of the sections of the manual."""
     parser = _Parser(
         prog="densify",
         usage="densify VERB [SPEC] [options]",

@@ -22,14 +22,14 @@ _MOST_DIGITS = 18
 
 
 def natural(text: str) -> int:
-    """Parse a whole number from 0 up; raise ArgumentTypeError for other texts."""
+    """Parse a whole number from 0 up. Raise ArgumentTypeError for other texts."""
     if not _are_digits(text):
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a whole number from 0 up")
     return int(text)
 
 
 def positive(text: str) -> float:
-    """Parse a finite number above 0; raise ArgumentTypeError for other texts."""
+    """Parse a finite number above 0. Raise ArgumentTypeError for other texts."""
     try:
         number = float(text)
     except ValueError:
@@ -40,18 +40,18 @@ def positive(text: str) -> float:
 
 
 def words(text: str) -> list[str]:
-    """Parse words separated by commas."""
+    """Parse words separated by commas, without empty ones."""
     return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def key_range(text: str, alternative: str = "") -> range:
-    """Parse ``A:B[:S]``, frames A to B - 1 by S (1); the message also names the ``alternative``."""
+    """Parse ``A:B[:S]`` as frames A to B - 1 by S, else 1. Errors also name the ``alternative``."""
     numbers = text.split(":")
     if len(numbers) in (2, 3) and _are_digits(*numbers):
-        first, end = int(numbers[0]), int(numbers[1])
+        begin, end = int(numbers[0]), int(numbers[1])
         step = int(numbers[2]) if len(numbers) == 3 else 1
-        if first < end and step > 0:
-            return range(first, end, step)
+        if begin < end and step > 0:
+            return range(begin, end, step)
     raise argparse.ArgumentTypeError(
         f"got {text!r}, expected {alternative}A:B[:S] with A < B, such as 0:100:5 for frames 0, 5 "
         f"to 95"
@@ -64,7 +64,7 @@ def all_or_range(text: str) -> range | None:
 
 
 def shard(text: str) -> tuple[int, int]:
-    """Parse ``i/n``, part i of n with i from 1 to n; raise ArgumentTypeError for other texts."""
+    """Parse ``i/n``, part i of n with i from 1 to n. Raise ArgumentTypeError for other texts."""
     part, slash, count = text.partition("/")
     if slash and _are_digits(part, count) and 1 <= int(part) <= int(count):
         return int(part), int(count)
@@ -141,7 +141,7 @@ def recordings_of(options: argparse.Namespace, default: str = "street") -> list[
 
 
 def recording_of(options: argparse.Namespace) -> str:
-    """Return the specification of a command's only recording; raise InputError for several."""
+    """Return the specification of a command's only recording. Raise InputError for several."""
     specs = recordings_of(options)
     if len(specs) > 1:
         raise InputError(f"got {len(specs)} recordings, {', '.join(specs)}; expected one")
@@ -178,7 +178,7 @@ def check_new_file(path: Path, overwrite: bool, suffix: str = "", option: str = 
 
 
 def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
-    """Return the frame numbers in the range ``--keys``, all for None; InputError for no frame."""
+    """Return the frame numbers within ``--keys``, all for None. Raise InputError if none fits."""
     from densify.readers.timeline import format_frames
 
     frames = [frame for frame in sequence.frames if keys is None or frame in keys]
@@ -191,7 +191,7 @@ def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
 
 
 def raise_failures(failures: Mapping[int, Exception], num: int, unit: str) -> None:
-    """Raise ComputationError, with reasons by frame, if some of ``num`` keys or sweeps failed."""
+    """Raise ComputationError, with reasons by frame, if any of ``num`` keys or sweeps failed."""
     if failures:
         reasons = "; ".join(f"{unit} {number}: {error}" for number, error in failures.items())
         raise ComputationError(f"{len(failures)} of {num} {unit}s not made: {reasons}")

@@ -63,7 +63,7 @@ def answer_info(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify doctor``: yield the findings; raise InputError if something is wrong."""
+    """Answer ``densify doctor``: yield the findings. Raise InputError if something is wrong."""
     config, spec = config_of(options), recording_of(options)
     sequence = open_sequence(spec)
     if options.write is not None:
@@ -123,6 +123,7 @@ def answer_dataset(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _check_set(options: argparse.Namespace) -> Iterator[Answer]:
+    """Yield the progress of a set. Raise ComputationError if ``--verify`` finds damaged files."""
     summary = status(options.status)
     files = damaged(options.status) if options.verify else []
     lines = [_describe_set(summary), *(f"damaged: {name}" for name in files)]
@@ -135,6 +136,7 @@ def _check_set(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def _recipe(options: argparse.Namespace) -> Recipe:
+    """Return the recipe of a set. ``--set`` has its limits, dataset.NAME, and other settings."""
     overrides = options.set or []
     limits = [text for text in overrides if text.strip().startswith("dataset.")]
     gate = {"dataset": asdict(Gate())}
@@ -150,6 +152,7 @@ def _recipe(options: argparse.Namespace) -> Recipe:
 
 
 def _make_set(options: argparse.Namespace) -> Iterator[Answer]:
+    """Make or continue a set with its page, and yield the progress."""
     out = options.out
     if out is None:
         raise InputError("--out DIR: expected the set's folder, a new one or one to go on with")
@@ -199,7 +202,7 @@ def _describe_set(summary: Summary) -> str:
 
 
 def _set_facts(summary: Summary) -> dict[str, Any]:
-    """Return the numbers of `_describe_set`."""
+    """Return the progress of a set as numbers, and its keys that are not done."""
     missing = [r for r in summary.records.values() if r.status != "done"]
     return {
         "num_keys": summary.num_keys,
@@ -250,6 +253,7 @@ def read_points(path: Path) -> Float:
 
 
 def _flow_of_recording(options: argparse.Namespace, config: Config) -> Iterator[Answer]:
+    """Write the flow of a recording's sweeps, and yield their number and folders."""
     specs = [spec for spec in (options.source, options.data) if spec is not None]
     if options.target is not None or len(specs) != 1 or options.all == (options.keys is not None):
         raise InputError(

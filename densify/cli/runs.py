@@ -123,7 +123,7 @@ def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
 
 
 def _front_first(paths: Sequence[Path], result: Result) -> list[Path]:
-    """Return the files of a run, those of the camera that looks ahead first."""
+    """Return the files of a run, beginning with those of the camera that looks ahead."""
     names = order_front_first([*result.depth], result.views, result.T_key_lidar)
     front = [
         path for path in paths if names and path.with_suffix("").as_posix().endswith(f"/{names[0]}")
@@ -178,10 +178,10 @@ def _summary(result: Result) -> str:
         lines.append(f"ghosts of the accumulated points: {ghosts}")
     for name in result.depth:
         for pixels, where in (("all", ""), ("moving", ", on moving objects")):
-            num = look_up(result.metrics, "held_out", name, "measured", pixels, "num_compared")
-            if (num or 0) < LEAST_PIXELS:
+            scored = ("held_out", name, "measured", pixels)
+            if (look_up(result.metrics, *scored, "num_compared") or 0) < LEAST_PIXELS:
                 continue
-            if outliers := _beside_icp(result, "held_out", name, "measured", pixels, "outliers"):
+            if outliers := _beside_icp(result, *scored, "outliers"):
                 lines.append(f"{name}, key held out: outliers{where}: {outliers}")
         if unjudged := look_up(result.metrics, "held_out", name, "unjudged"):
             lines.append(
@@ -197,7 +197,7 @@ def _of_pixels(measured: float | None, filled: float | None) -> str:
 
 
 def _beside_icp(result: Result, *path: str) -> str:
-    """Return a share as text, with the share of rigid accumulation in brackets; "" for none."""
+    """Return a share as text, with that of rigid accumulation in brackets, or "" for no share."""
     share = look_up(result.metrics, *path)
     rigid = result.baselines.get("icp")
     by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
@@ -251,7 +251,7 @@ def _comparison(results: Mapping[str, Result]) -> str:
 
 
 def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify export``: write a finished run in another format; yield what is left."""
+    """Answer ``densify export``: write a run in another format, and yield what the limits keep."""
     exported = export_run(
         options.run,
         options.to,
@@ -280,7 +280,7 @@ def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
 
 
 def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify view``: show finished runs in a viewer until it is closed."""
+    """Answer ``densify view``: show finished runs until the user closes the viewer."""
     runs = finished_runs(options.dir, Thresholds(cameras=options.camera))
     viewers = {"rerun": show_in_rerun, "open3d": show_in_open3d}
     viewers[vars(options)["with"]](runs)
@@ -293,16 +293,16 @@ def answer_evaluate(options: argparse.Namespace) -> Iterator[Answer]:
     pairs = pair_depth_files(options.predicted, options.truth, options.mask, filled=options.filled)
     with progress_on_stderr() as progress:
         scores = evaluate(pairs, options.focal_px, options.baseline_m, progress)
-    num, density = scores["num_images"], scores["density"]
+    num_images, density = scores["num_images"], scores["density"]
     lines = [
-        f"{num:,} image{'s' if num != 1 else ''}: predicted {percent(density['predicted'])} of "
-        f"the pixels, truth {percent(density['truth'])}; outliers with fx "
-        f"{scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
+        f"{num_images:,} image{'s' * (num_images != 1)}: predicted "
+        f"{percent(density['predicted'])} of the pixels, truth {percent(density['truth'])}; "
+        f"outliers with fx {scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
     ]
     for name, title in _UNPAIRED.items():
         if paths := scores[name]:
             num_more = len(paths) - _MOST_NAMED
             more = f", ... and {num_more:,} more" if num_more > 0 else ""
             lines.append(f"{title}: {len(paths):,}: {', '.join(paths[:_MOST_NAMED])}{more}")
-    columns = {name: column for name, column in scores["parts"].items() if column["num_pixels"]}
+    columns = {part: errors for part, errors in scores["parts"].items() if errors["num_pixels"]}
     yield Answer("\n".join([*lines, numbers_table(columns)]), {"scores": scores})

@@ -50,7 +50,7 @@ class Answer:
 
 
 def first_of(files: Sequence[Path], kinds: Mapping[str, str]) -> dict[Path, str]:
-    """Return three files to open first -> their content, one for each path pattern of ``kinds``."""
+    """Return up to three files to open first -> content, one for each pattern of ``kinds``."""
     first: dict[Path, str] = {}
     for pattern, content in kinds.items():
         path = next((f for f in files if f.match(pattern) and f not in first), None)
@@ -91,7 +91,7 @@ def aligned(rows: Sequence[Sequence[str]], side: str = ">") -> str:
 
 
 def written(value: float | None, form: str) -> str:
-    """Return a number as text in the format ``form``, such as ".2f m" with a unit; "-" for None."""
+    """Return a number as text in a format such as ".2f m", a unit at its end, or "-" for None."""
     if value is None:
         return "-"
     number, _, unit = form.partition(" ")
@@ -99,7 +99,7 @@ def written(value: float | None, form: str) -> str:
 
 
 def percent(value: float | None, digits: int = 2) -> str:
-    """Return a share, 0 to 1, as a percentage with this number of digits; "-" for None."""
+    """Return a share, 0 to 1, as a percentage with this number of digits, or "-" for None."""
     return written(value, f".{digits}%")
 
 
@@ -112,7 +112,7 @@ def look_up(metrics: Mapping[str, Any], *path: str) -> Any:
 
 
 class Screen(logging.Handler):
-    """The output of one command: text, or one JSON object at the end; log lines above the bar."""
+    """The output of one command: text with log lines above the bar, or one JSON object."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -127,7 +127,7 @@ class Screen(logging.Handler):
         self._facts = {"schema": _SCHEMA, "verb": verb, "files": [], "open_first": []}
 
     def show(self, answer: Answer) -> None:
-        """Print the answer, or keep it until the end for ``--json``."""
+        """Print the answer, or keep its facts for the JSON object at the end."""
         if self._is_json:
             files = {"files": answer.files, "open_first": [*answer.first]}
             for name, value in {**answer.facts, **files}.items():
@@ -152,7 +152,7 @@ class Screen(logging.Handler):
         return exit_code
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a line, and keep it if it is a warning."""
+        """Print the message of a record, and keep a warning for the JSON object."""
         text = shorten_message(" ".join(record.getMessage().split()))
         is_warning = record.levelno == logging.WARNING
         if is_warning:
@@ -218,7 +218,7 @@ def _above_bars() -> AbstractContextManager[None]:
 
 
 def log_warnings(warned: Iterable[tuple[str, str, int]]) -> None:
-    """Log each distinct warning once with its keys; ``warned`` are (warning, recording, key)."""
+    """Log each distinct warning once with its keys, from (warning, recording, key) triples."""
     from densify.readers.timeline import format_frames
 
     log = logging.getLogger("densify")

@@ -54,8 +54,8 @@ def call_all(
         call: Function of one item, defined in a module so that processes can import it.
         groups: Non-empty groups of hashable, picklable items. A group's first item is finished
             before the others begin, so they find shared results in the cache.
-        num_workers: Number of processes; 1 uses this process.
-        log: File to which worker processes append their log; None for no log.
+        num_workers: Number of processes. 1 uses this process.
+        log: File to which worker processes append their log, None for no log.
         scheduler: Address of a Dask scheduler whose workers replace local processes, or None.
     """
     if num_workers == 1 and scheduler is None:
@@ -68,6 +68,7 @@ def call_all(
     suspects: deque[Item] = deque()  # items that were running when a process died
     while ready or suspects:
         is_retry = bool(suspects)
+        # One suspect at a time, so that a second death has a single culprit.
         waiting, num_processes = (suspects, 1) if is_retry else (ready, num_workers)
         workers = _open_pool(num_processes) if scheduler is None else _open_dask(scheduler)
         for item, outcome in _until_a_death(partial(_call_logged, call, log), waiting, workers):

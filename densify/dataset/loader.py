@@ -53,7 +53,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         split: Literal["train", "val"] | None = None,
         max_outliers: float | None = None,
     ) -> None:
-        """Find the finished key sweeps of a training set; raise InputError if there are none.
+        """Find the finished key sweeps of a training set. Raise InputError if there are none.
 
         Args:
             root: Folder of the training set, ``--out`` of `densify dataset`.
@@ -123,7 +123,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
 
         dense_m = read(self._dense, read_depth_png)
         stored = read("confidence", lambda path: read_stored(path, np.uint8, "a confidence map"))
-        # Stored values are 1 to 255, see `densify.outputs.depth_png.stored_confidence`.
+        # Stored values 1 to 255 are confidence 0 to 1.
         confidence = np.where(dense_m > 0, (stored - np.float32(1)) / 254, np.float32(0)).clip(0)
         if self._max_outliers is not None:
             kept = dense_m > 0
@@ -139,7 +139,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
     def _cut(
         self, maps: Mapping[str, NDArray[Any]], camera: Camera, drive: str
     ) -> tuple[dict[str, NDArray[Any]], Float]:
-        """Return the maps, cropped and flipped at random, and their intrinsics (3,3)."""
+        """Return the maps, cropped and flipped at random, and their intrinsics (3,3) in pixels."""
         height_px, width_px = self._crop or (camera.height_px, camera.width_px)
         if not (0 < height_px <= camera.height_px and 0 < width_px <= camera.width_px):
             raise InputError(
@@ -157,7 +157,7 @@ class DepthDataset(Dataset[dict[str, Any]]):
         return {name: array[:, top:, columns][..., ::step] for name, array in maps.items()}, K
 
     def _image(self, drive: str, camera: Camera, frame: int) -> NDArray[np.uint8]:
-        """Return the (H,W,3) RGB image of a camera at a key sweep."""
+        """Return the RGB image (H,W,3) of a camera at a key sweep."""
         spec = self._specs[drive]
         try:
             recording = _open(spec, os.getpid())
@@ -180,6 +180,7 @@ def _open(spec: str, process: int) -> LidarSequence:
 
 
 def _read_drives(root: Path) -> dict[str, Drive]:
+    """Return the drives of a training set by name. Raise InputError for another folder."""
     table, wanted = read_plan(root), "expected a set that densify dataset --layout kitti-depth made"
     if table is None:
         raise InputError(f"{root / 'dataset.json'}: no such file; {wanted}")

@@ -108,10 +108,10 @@ def make_dataset(
     """Make a training set from the key sweeps of whole recordings, and return the final progress.
 
     A repeated call keeps finished key sweeps. Files do not depend on processes or interruptions. A
-    full disk or the loss of all workers raises ComputationError; finished key sweeps are kept.
+    full disk or the loss of all workers raises ComputationError, and finished key sweeps are kept.
 
     Args:
-        data: Recordings, as `densify.open_sequence` takes them.
+        data: Recordings, each a text for `densify.open_sequence`.
         out: Folder of the training set.
         keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``. None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
@@ -155,7 +155,7 @@ def make_dataset(
 
 
 def status(out: Path) -> Summary:
-    """Return the progress of a training set from its files; raise InputError if it is none."""
+    """Return the progress of a training set from its files. Raise InputError if it is none."""
     table = read_plan(out)
     if table is None:
         raise InputError(f"--status {out}: no dataset.json in it; expected a set's folder")
@@ -188,10 +188,11 @@ def _num_processes(wanted: int | None, recipe: Recipe, drives: Sequence[Drive]) 
         if wanted < 1:
             raise InputError(f"--workers {wanted}: expected 1 or more processes")
         return wanted
+    # The scarcest of memory, cores and work decides.
     need_bytes = _BASE_BYTES + _SWEEP_BYTES * (2 * recipe.window + 1)
     num_keys = sum(len(drive.keys) for drive in drives)
-    limits = (_free_bytes() / need_bytes, num_threads(), num_keys / _KEYS_PER_PROCESS)
-    return max(1, int(min(limits)))
+    most = (_free_bytes() / need_bytes, num_threads(), num_keys / _KEYS_PER_PROCESS)
+    return max(1, int(min(most)))
 
 
 def _free_bytes() -> float:
@@ -216,7 +217,7 @@ def _blocks(drives: Sequence[Drive], shard: Shard | None, recipe: Recipe, out: P
 
 
 def _finished(blocks: Sequence[_Keys], out: Path, verify: bool) -> dict[Key, KeyRecord]:
-    """Return the records of the key sweeps in these blocks that are finished, sorted by key."""
+    """Return the records of the finished key sweeps in these blocks, sorted by key."""
     wanted = {(job.drive.name, key) for block in blocks for job, key in block}
     before = read_manifests(out)
     return {name: before[name] for name in sorted(wanted & finished(before.values(), out, verify))}
@@ -239,7 +240,7 @@ def _record(
     num_keys: int,
     report: Callable[[Summary], None] | None,
 ) -> Summary:
-    """Record and report the outcomes of `call_all` as they come; return the final progress."""
+    """Record and report the outcomes of `call_all` as they come, and return the final progress."""
     start_s = time.monotonic()
     summary = Summary(records, num_keys)
     try:
@@ -272,7 +273,7 @@ def _set_aside(
     out: Path,
     drives: Sequence[Drive],
 ) -> dict[Key, KeyRecord]:
-    """Put keys far worse than their neighbours aside, and return their new records."""
+    """Put keys far worse than their neighbours aside, and return their new records by key."""
     drive_of = {drive.name: drive for drive in drives}
 
     def keep(record: KeyRecord) -> list[Path]:
@@ -332,7 +333,7 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
 
 @dataclass(frozen=True)
 class Job:
-    """A recording of a training set, as every process opens it."""
+    """A recording of a training set, as every process opens the recording."""
 
     drive: Drive
     recipe: Recipe
@@ -367,7 +368,7 @@ def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
 
 
 def _densified(job: Job, key: int) -> KeyRecord:
-    """Densify and write one key, unless its scores are beyond a limit; return its record."""
+    """Densify one key, write the files if its scores are within the limits, return its record."""
     recipe = job.recipe
     recording, cache = _opened(job)
     is_tree = recipe.layout == "kitti-depth"
@@ -393,7 +394,7 @@ def _densified(job: Job, key: int) -> KeyRecord:
 
 
 def _keep_result(job: Job, result: Result) -> list[Path]:
-    """Write the picture of a key that is beyond a limit, if it has a map, and return its path."""
+    """Write the picture of a key beyond a limit, if the key has a map, and return the path."""
     camera = front_camera(job.drive)
     maps = [maps for name, maps in result.depth.items() if name.partition("/")[0] == camera]
     return [keep_picture(job.out, job.drive, result.key, m.filled_m) for m in maps[:1]]
@@ -425,7 +426,7 @@ def _write(job: Job, results: Mapping[str, Result]) -> list[Path]:
 
 @lru_cache(maxsize=1)
 def _opened(job: Job) -> tuple[Recording, Cache]:
-    """Return a job's recording with its cache; raise ComputationError for another version."""
+    """Return a job's recording with its cache. Raise ComputationError for another version."""
     if job.version != __version__:
         raise ComputationError(
             f"the worker on {platform.node()} has densify {__version__}, the command has "

@@ -89,7 +89,7 @@ class KeyRecord:
         return self.drive, self.key
 
     def values_of(self, score: str) -> list[float]:
-        """Return the known values of a score: one for each camera, or a single one; [] for none."""
+        """Return the known values of a score, one for each camera or a single one, [] for none."""
         score_value = self.scores.get(score)
         values = score_value.values() if isinstance(score_value, Mapping) else [score_value]
         return [value for value in values if value is not None]
@@ -128,8 +128,8 @@ def manifest(folder: str | Path) -> Any:
     """Return a training set's manifest as a pandas.DataFrame, with a row for each key sweep.
 
     Columns are ``drive``, ``key``, ``status``, ``reason``, ``seconds``, ``num_sweeps``,
-    ``warnings``, and the scores, those of cameras as ``density.image_02``. Without pandas,
-    InputError is raised. A folder without a manifest gives an empty table.
+    ``warnings``, and the scores. A score of cameras has a column for each camera, such as
+    ``density.image_02``. Raise InputError without pandas, or if the folder has no records.
     """
     pandas = import_extra("pandas", "pandas", "tables of a manifest")
     fields = ("drive", "key", "status", "reason", "seconds")
@@ -150,7 +150,7 @@ def manifest(folder: str | Path) -> Any:
 
 
 def describe_pace(records: Iterable[KeyRecord]) -> str:
-    """Return the computing time of a key as text: the mean over all that were tried, the range."""
+    """Return the mean and the range of the computing times of all tried keys as text."""
     seconds = [record.seconds for record in records]
     if not seconds:
         return ""
@@ -159,12 +159,13 @@ def describe_pace(records: Iterable[KeyRecord]) -> str:
 
 
 def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:
-    """Return as text how long further keys take, if known, else how many are left; "" for none."""
+    """Return the expected time of the ``num_left`` keys as text, their number if unknown, or ""."""
     seconds = sorted(record.seconds for record in records)
     if len(seconds) < 2 or not num_left:
         return f"{num_left:,} keys are left" if num_left else ""
-    others = seconds[:-1]  # the slowest key waited for compilation
-    low_s, high_s = np.quantile(others, 0.25), max(np.quantile(others, 0.75), np.mean(others))
+    usual_s = seconds[:-1]  # the slowest key waited for compilation
+    # Quartiles. A few slow keys may raise the mean, which the sum follows, above the upper one.
+    low_s, high_s = np.quantile(usual_s, 0.25), max(np.quantile(usual_s, 0.75), np.mean(usual_s))
     low, high = (f"{num_left * value / 60:.0f}" for value in (low_s, high_s))
     span = high if low == high else f"{low} to {high}"
     return f"the other {num_left:,} keys take about {span} min in one process"
@@ -203,8 +204,9 @@ def damaged_files(record: KeyRecord, root: Path, by_content: bool = True) -> lis
 
 
 def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> set[Key]:
-    """Return the names of the finished records: those put aside, and those done with whole files.
+    """Return the drive and key of each record that needs no second attempt.
 
+    These are records put aside, and done ones with at least one file, whose files are all whole.
     ``verify`` compares files with their hashes. Otherwise only their sizes are compared.
     """
     return {
@@ -216,12 +218,12 @@ def finished(records: Iterable[KeyRecord], root: Path, verify: bool = False) -> 
 
 
 class Manifest:
-    """The manifest file of a run or shard, open for one process. Opening and closing sort it."""
+    """The manifest file of a run or shard for one process, sorted when opened and closed."""
 
     def __init__(self, root: Path, shard: tuple[int, int] | None = None) -> None:
-        """Open the manifest of a training set, or of shard (k, n); its folder is made if needed.
+        """Open the manifest of a training set, or of shard (k, n), and make its folder if needed.
 
-        InputError is raised if another run has the manifest open.
+        Raise InputError if another run has the manifest open.
         """
         stem = "manifest" if shard is None else f"manifest-{shard[0]}of{shard[1]}"
         self.path = root / f"{stem}.jsonl"
@@ -244,7 +246,7 @@ class Manifest:
         os.close(self._lock)
 
     def append(self, record: KeyRecord) -> None:
-        """Add or replace the record of a key sweep. The record is on the disk at return."""
+        """Add or replace the record of a key sweep. At return, the record is on the disk."""
         with self._errors_explained(), self.path.open("ab") as file:
             file.write(record.to_line())
             file.flush()
@@ -255,7 +257,7 @@ class Manifest:
         reasons: Mapping[Key, str],
         keep_picture: Callable[[KeyRecord], Iterable[Path]],
     ) -> list[KeyRecord]:
-        """Delete the files of these finished keys, record the reasons, return the new records.
+        """Delete the files of finished keys, record the reasons, and return the new records.
 
         ``keep_picture`` returns the paths of files that take their place. Keys that are not done in
         this manifest are left out.

@@ -64,7 +64,7 @@ class Gate(Section):
     split: str = choice_field("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
-        """Return why a key sweep is beyond a limit, None if it is within all limits.
+        """Return why a key sweep is beyond a limit, or None within all limits.
 
         ``scores`` are those of a manifest line. ``num_sweeps`` is the size of the window.
         """
@@ -134,9 +134,10 @@ class Drive:
 
 
 def plan(data: Sequence[str], keys: slice | None, recipe: Recipe) -> list[Drive]:
-    """Return every recording with its chosen key sweeps, by the arguments of `make_dataset`.
+    """Return every recording with its chosen key sweeps.
 
-    InputError is raised for a recording that is given twice, has no camera or lacks the keys.
+    ``data`` and ``keys`` are the arguments of `make_dataset`. Raise InputError for a recording that
+    is given twice, has no camera or lacks the keys.
     """
     drives: dict[str, Drive] = {}
     for spec in data:
@@ -180,22 +181,22 @@ def choose_spread(drives: Sequence[Drive], num_keys: int) -> list[Drive]:
 
 
 def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, ...]:
-    """Return the chosen frame numbers of a recording; raise InputError if there are none."""
+    """Return the chosen frame numbers of a recording. Raise InputError if there are none."""
     if keys is None:
         return tuple(sequence.frames)
-    first, last = min(sequence.frames), max(sequence.frames)
-    start = first if keys.start is None else keys.start
-    stop = last + 1 if keys.stop is None else keys.stop
+    lowest, highest = min(sequence.frames), max(sequence.frames)
+    start = lowest if keys.start is None else keys.start
+    stop = highest + 1 if keys.stop is None else keys.stop
     step = 1 if keys.step is None else keys.step
     if not all(isinstance(number, int) for number in (start, stop, step)) or step < 1:
         raise InputError(f"keys: got {keys}, expected whole numbers and a step of 1 or more")
     wanted = range(start, stop, step)
     chosen = tuple(frame for frame in sequence.frames if frame in wanted)
-    if not chosen or (start < first or wanted[-1] > last):
+    if not chosen or start < lowest or wanted[-1] > highest:
         text = f"{start}:{stop}" + ("" if step == 1 else f":{step}")
         raise InputError(
             f"--keys {text}: {sequence.name} ({spec}) has {format_frames(sequence.frames)}; "
-            f"expected A:B within {first}:{last + 1}, or all"
+            f"expected A:B within {lowest}:{highest + 1}, or all"
         )
     return chosen
 
@@ -216,7 +217,7 @@ def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
 
 
 def read_plan(out: Path) -> dict[str, Any] | None:
-    """Return the content of dataset.json, None without the file; InputError if it is damaged."""
+    """Return the content of dataset.json, None without it. Raise InputError if damaged."""
     path = out / _FILE
     if not path.is_file():
         return None
@@ -280,7 +281,7 @@ def _table(recipe: Recipe, drives: Sequence[Drive]) -> dict[str, Any]:
 
 
 def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Raise InputError if a set was made with another recipe or version."""
+    """Raise InputError if a set was made with another recipe or another version of densify."""
     expected, got = (_flat({name: table[name] for name in _SAME}) for table in (before, now))
     for option in {**expected, **got}:
         if got.get(option) != expected.get(option):
@@ -291,7 +292,7 @@ def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) ->
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested mappings by their dotted names, such as ``gate.max_ghost``."""
+    """Return the values of nested mappings by dotted names, such as ``gate.max_ghost``."""
     values: dict[str, Any] = {}
     for name, value in table.items():
         nested = isinstance(value, Mapping)
@@ -300,21 +301,21 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _united(out: Path, before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Return the drives of an earlier plan with those of this run, their frames together."""
+    """Return the drives of both plans. The frames of a drive in both are joined."""
     united = dict(before)
     for name, drive in now.items():
-        old = before.get(name, drive)
-        if not is_same(name, drive["data"], name, old["data"]):
+        earlier = before.get(name, drive)
+        if not is_same(name, drive["data"], name, earlier["data"]):
             raise InputError(
-                f"--out {out}: {name} in the set is another recording, {old['data']}; got "
+                f"--out {out}: {name} in the set is another recording, {earlier['data']}; got "
                 f"{drive['data']}; choose another --out"
             )
         for entry in ("folder", "cameras"):
-            if old[entry] != drive[entry]:
+            if earlier[entry] != drive[entry]:
                 raise InputError(
                     f"--out {out}: {name} is in the set with other {entry}; choose another --out"
                 )
-        frames = {*_frames(old["frames"]), *_frames(drive["frames"])}
+        frames = {*_frames(earlier["frames"]), *_frames(drive["frames"])}
         united[name] = {**drive, "frames": _as_runs(sorted(frames))}
     if len({drive["folder"] for drive in united.values()}) < len(united):
         raise InputError(f"--out {out}: holds another recording; choose another --out")

@@ -50,12 +50,12 @@ class Picture(NamedTuple):
     jpeg: bytes  # bytes of the image file
 
     def measured_m(self) -> Float32:
-        """Return (H,W) measured depth along the camera's axis in metres, 0 for no depth."""
+        """Return the measured depth (H,W) along the camera's axis in metres, 0 for no depth."""
         self.run.require_z(self.map)
         return metres(self.run.maps(self.map)["depth"])
 
     def rectified_m(self, to: str) -> Float32:
-        """Return `measured_m`; raise InputError, for format ``to``, if the image has distortion."""
+        """Return `measured_m`. Raise InputError, for format ``to``, if the image has distortion."""
         depth_m = self.measured_m()
         if not self.camera.is_rectified:
             raise InputError(
@@ -123,7 +123,7 @@ def write_nerfstudio(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a scene as map-anything's data_processing/README.md has it; depth in metres, 0 none."""
+    """Write a scene in map-anything's format (data_processing/README.md), depth in m, 0: none."""
     pictures = _pictures(runs, flat=True)
     _write_jpegs(pictures, folder)
     frames = []
@@ -147,7 +147,7 @@ def write_wai(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write a training set as MoGe's docs/train.md has it; depth on a log scale, 0 for none."""
+    """Write a training set in MoGe's format (docs/train.md), depth on a log scale, 0 for none."""
     names = []
     for run in runs:
         for picture in _pictures([run], flat=True):
@@ -163,10 +163,10 @@ def write_moge(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def _pictures(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture]:
-    """Return the images of the runs; ``flat`` names have no folders, which some readers drop."""
+    """Return the images of the runs. ``flat`` names have no folders, which some readers drop."""
     pictures = []
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
-        for map_name in run.cameras:
+        for map_name in run.chosen_maps:
             if (jpeg := run.jpeg(map_name)) is not None:
                 view = run.scene.views[map_name]
                 name = f"{run.key:06d}/{map_name}" if len(runs) > 1 else map_name
@@ -175,8 +175,8 @@ def _pictures(runs: Sequence[FinishedRun], flat: bool = False) -> list[Picture]:
                 pictures.append(Picture(name, run, map_name, view.camera, T_cam_world, jpeg))
     if not pictures:
         raise InputError(
-            f"{runs[0].folder}: no images in scene/image of {', '.join(runs[0].cameras)}; densify "
-            f"the key with a camera that has images"
+            f"{runs[0].folder}: no images in scene/image of {', '.join(runs[0].chosen_maps)}; "
+            f"densify the key with a camera that has images"
         )
     return pictures
 
@@ -239,9 +239,10 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
             f"{camera.name}: its lens ({camera.model}, {len(lens)} coefficients) has no equal "
             f"there; leave it out by naming the others with --camera"
         )
-    num = max(4, len(lens)) if any(lens) or camera.model == "fisheye" else 0
+    # OpenCV has no model with fewer than four coefficients.
+    num_coefficients = max(4, len(lens)) if any(lens) or camera.model == "fisheye" else 0
     pinhole = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
-    padded = dict(zip(names[:num], lens + [0.0] * len(names), strict=False))
+    padded = dict(zip(names[:num_coefficients], lens + [0.0] * len(names), strict=False))
     return {name: float(value) for name, value in (pinhole | padded).items()}
 
 
@@ -257,7 +258,7 @@ def _shared_fields(picture: Picture) -> dict[str, Any]:
 
 
 def _nerfstudio_frame(picture: Picture, depth: str) -> dict[str, Any]:
-    """Return the entry of a picture in transforms.json; ``depth`` is the path of its depth."""
+    """Return the entry of a picture in transforms.json, whose depth file is ``depth``."""
     frame, lens = _shared_fields(picture), _intrinsics(picture.camera)
     supported = _FISHEYE_LENS if picture.camera.model == "fisheye" else _LENS[:5]
     if unknown := [name for name in _LENS if lens.get(name) and name not in supported]:
@@ -277,6 +278,7 @@ def _write_inverse_depths(pictures: Sequence[Picture], folder: Path) -> None:
         picture.run.require_z(picture.map)
         depths_m[picture.name] = picture.run.full_m(picture.map)
     nearest_m = min(float(d[d > 0].min(initial=np.inf)) for d in depths_m.values())
+    # One scale for all pictures: inverse depth = scale * step / 65536
     scale = 1 / nearest_m if np.isfinite(nearest_m) else 1.0
     for picture in pictures:
         depth_m = depths_m[picture.name]
@@ -316,15 +318,16 @@ def _save_splats(path: Path, points: Float, rgb: NDArray[np.uint8]) -> None:
 
 
 def _logarithmic_png(depth_m: Float32) -> bytes:
-    """Return the bytes of depth.png for (H,W) metres, see `write_moge`."""
+    """Return the PNG of depth (H,W) in metres on a log scale of 16 bits, 0 for no depth."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
+    # step = 1 + 65533 ln(depth / near) / ln(far / near)
     known, steps = depth_m > 0, np.zeros(depth_m.shape, np.uint16)
     near_m = float(depth_m[known].min(initial=1.0))
-    far_m = max(float(depth_m[known].max(initial=1.0)), 1.1 * near_m)  # they must differ
-    share = np.log(depth_m[known] / near_m) / np.log(far_m / near_m)
-    steps[known] = 1 + np.rint(share * _LOG_STEPS)
+    far_m = max(float(depth_m[known].max(initial=1.0)), 1.1 * near_m)  # above near, for the log
+    fraction = np.log(depth_m[known] / near_m) / np.log(far_m / near_m)
+    steps[known] = 1 + np.rint(fraction * _LOG_STEPS)
     info, file = PngInfo(), io.BytesIO()
     info.add_text("near", repr(near_m))
     info.add_text("far", repr(far_m))

@@ -58,7 +58,7 @@ class StoredCloud:
     rgb: NDArray[np.uint8]  # (M,3) colour, 0 where no camera observed the point
     far: Bool  # (M,) True for points of sweeps beyond the window
     displacement: Float32  # (M,3) metres from the rigidly accumulated position to ``points``
-    gps_time: Float  # (M,) reference time of the source sweep in seconds, see `write_cloud`
+    gps_time: Float  # (M,) reference time of the source sweep, s since 1980-01-06 minus 10^9
 
     @property
     def rigid_points(self) -> Float:
@@ -81,7 +81,7 @@ class StoredCloud:
         return np.where(self.observed[:, None], self.rgb, _UNOBSERVED)
 
     def sweep(self, frame: int) -> StoredCloud:
-        """Return the points of the sweep with this frame number, if it is in the window."""
+        """Return the points of a sweep by its frame number, without points beyond the window."""
         return self.select((self.frame == frame) & ~self.far)
 
     def select(self, keep: Bool | Int) -> StoredCloud:
@@ -101,11 +101,12 @@ class StoredCloud:
 
 
 def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
-    """Write a cloud as LAZ with positions rounded to 1 mm; ``stamp_ns`` is the key sweep's time.
+    """Write a cloud as LAZ with positions rounded to 1 mm.
 
-    ``gps_time`` is as in LAS 1.4: seconds since 1980-01-06 minus 10^9, without leap seconds. The
-    header has the day of ``stamp_ns``. Equal clouds give equal bytes. Raise ValueError for points
-    that are not finite or beyond 2,147 km.
+    ``stamp_ns`` is the key sweep's reference time in ns since 1970, whose day is in the header. A
+    point's ``gps_time`` is the reference time of its source sweep as in LAS 1.4: seconds since
+    1980-01-06 minus 10^9, without leap seconds. Equal clouds give equal bytes. Raise ValueError for
+    points that are not finite or beyond 2,147 km.
     """
     import laspy
 
@@ -137,7 +138,7 @@ def write_cloud(path: Path, cloud: Cloud, stamp_ns: int = 0) -> None:
 
 
 def read_cloud(path: Path) -> StoredCloud:
-    """Return the cloud in a file that `write_cloud` wrote; raise InputError for other files."""
+    """Return the cloud in a file of `write_cloud`. Raise InputError for other files."""
     las = read_las(path)
     if missing := _DIMENSIONS - set(las.point_format.dimension_names):
         raise InputError(

@@ -33,28 +33,28 @@ def encode_png(image: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:
 
 
 def encode_jpeg(picture: Picture, quality: int = 92) -> bytes:
-    """Return the bytes of a JPEG file of an (H,W,3) RGB picture; ``quality`` is 0 to 100."""
+    """Return the bytes of a JPEG file of an (H,W,3) RGB picture, with a quality from 0 to 100."""
     bgr = np.ascontiguousarray(picture[:, :, ::-1])
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def map_path(folder: Path, kind: str, name: str, suffix: str = ".png") -> Path:
-    """Return the path ``folder/kind/name.png`` of a map; the name is CAMERA or CAMERA/NUMBER."""
+    """Return the path ``folder/kind/name.png`` of a map named CAMERA or CAMERA/NUMBER."""
     return folder / kind / f"{name}{suffix}"
 
 
 def write_depth_png(path: Path, depth_m: Float32) -> None:
-    """Write (H,W) depth in metres as 16-bit PNG ``rint(256 * depth_m)``, 0 for none or > 256 m."""
+    """Write depth (H,W) in metres as 16-bit PNG ``rint(256 * depth_m)``, 0 for none or > 256 m."""
     write_file(path, encode_png(_quantised(depth_m)))
 
 
 def write_confidence_png(path: Path, confidence: Float32, depth_m: Float32) -> None:
-    """Write (H,W) confidence as 8-bit PNG of `stored_confidence`, 0 where no depth is stored."""
+    """Write confidence (H,W) as 8-bit PNG, ``1 + rint(254 * confidence)``, 0 without a depth."""
     _write_where_depth(path, depth_m, confidence, stored_confidence)
 
 
 def write_age_png(path: Path, age_s: Float32, depth_m: Float32) -> None:
-    """Write (H,W) ages in seconds as 16-bit PNG of `stored_age`, 0 where no depth is stored."""
+    """Write ages (H,W) in seconds as 16-bit PNG, ``1 + rint(1000 * age_s)``, 0 without a depth."""
     _write_where_depth(path, depth_m, age_s, stored_age)
 
 
@@ -68,24 +68,24 @@ def _write_where_depth(
 
 
 def stored_confidence(confidence: ArrayLike) -> NDArray[np.uint8]:
-    """Return ``1 + rint(254 * confidence)``: 1 to 255 for confidence 0 to 1. 0 means no depth."""
+    """Return confidence as stored: ``1 + rint(254 * confidence)``, 1 to 255. 0 means no depth."""
     levels = np.rint(STEPS_OF_CONFIDENCE * np.asarray(confidence, np.float64))
     return (1 + levels).astype(np.uint8)
 
 
 def confidence_of(stored: NDArray[np.uint8]) -> Float32:
-    """Return the (H,W) confidence, 0 to 1, of values of `stored_confidence`, 0 without depth."""
+    """Return confidence (H,W), 0 to 1, from stored values of 1 to 255, or 0 from 0 (no depth)."""
     return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(STEPS_OF_CONFIDENCE)
 
 
 def stored_age(age_s: ArrayLike) -> NDArray[np.uint16]:
-    """Return ``1 + rint(1000 * age_s)``. 65535 means 65.5 s or more, 0 means no depth."""
+    """Return ages as stored: ``1 + rint(1000 * age_s)``, up to 65.5 s. 0 means no depth."""
     steps = np.rint(_STEPS_PER_S * np.asarray(age_s, np.float64))
     return (1 + np.minimum(steps, _MAX_VALUE - 1)).astype(np.uint16)
 
 
 def age_of(stored: NDArray[np.uint16]) -> Float32:
-    """Return the (H,W) age in seconds of stored pixel values, 0 without depth; see `stored_age`."""
+    """Return ages (H,W) in seconds from stored values, ``(stored - 1) / 1000``, 0 without depth."""
     return np.maximum(stored.astype(np.float32) - 1, 0) / np.float32(_STEPS_PER_S)
 
 
@@ -103,12 +103,12 @@ def write_flow_png(path: Path, flow_px: Float32) -> None:
 
 
 def metres(stored: NDArray[np.uint16]) -> Float32:
-    """Return the (H,W) float32 depth in metres of stored pixel values, ``stored / 256``."""
+    """Return depth (H,W) in metres as float32 from stored values, ``stored / 256``."""
     return stored.astype(np.float32) / np.float32(_STEPS_PER_M)
 
 
 def read_depth_png(path: Path) -> Float32:
-    """Return the (H,W) float32 depth in metres of a depth map's PNG, 0 for no depth."""
+    """Return the depth (H,W) of a depth map's PNG in metres as float32, 0 for no depth."""
     return metres(read_stored(path, np.uint16, "a depth map"))
 
 
@@ -116,7 +116,7 @@ PixelType = type[np.uint8] | type[np.uint16]
 
 
 def read_stored(path: Path, kind: PixelType, map_name: str) -> NDArray[Any]:
-    """Return a PNG's (H,W) values; InputError, "expected ``map_name``", if not of type ``kind``."""
+    """Return a PNG's values (H,W). Raise InputError, with ``map_name``, if not of type ``kind``."""
     image = read_image(path, as_stored=True)
     if image.dtype != kind or image.ndim != 2:
         got = f"{image.dtype} of shape {image.shape}"
@@ -126,7 +126,7 @@ def read_stored(path: Path, kind: PixelType, map_name: str) -> NDArray[Any]:
 
 
 def read_mask_png(path: Path) -> Bool:
-    """Return an (H,W) mask, True where a colour channel is above 0; transparency is ignored."""
+    """Return a mask (H,W), True where a colour channel is above 0, whatever the transparency."""
     image = read_image(path, as_stored=True)
     colours = image if image.ndim == 2 else image[:, :, :3].max(axis=2)
     mask: Bool = colours > 0

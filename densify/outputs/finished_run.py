@@ -46,7 +46,7 @@ _KINDS: Mapping[str, PixelType] = {
 
 
 class Thresholds(NamedTuple):
-    """The pixels and points of a run that are read."""
+    """Limits that select which pixels and points of a run are read. By default, all are read."""
 
     min_confidence: float = 0.0  # least confidence, 0 to 1
     # Greatest time from the source sweep to the image's exposure (pixels) or the key sweep
@@ -59,10 +59,10 @@ EVERYTHING = Thresholds()
 
 
 class Kept(NamedTuple):
-    """A share of pixels with a depth, or a number of points, and how much the thresholds keep."""
+    """A share of pixels with a depth, or a number of points, before and after the thresholds."""
 
-    before: float  # value without thresholds on confidence and age
-    after: float  # value within the thresholds
+    before: float  # share or number without thresholds on confidence and age
+    after: float  # share or number within the thresholds
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class SceneFile:
 
 
 class LoadedMaps(NamedTuple):
-    """The maps of one image; 0 where there is no depth."""
+    """The maps of one image, which are 0 where no depth is."""
 
     depth_m: Float32  # (H,W) measured depth in metres
     filled_m: Float32  # (H,W) measured and filled depth in metres
@@ -86,7 +86,7 @@ class LoadedMaps(NamedTuple):
 
 @dataclass(frozen=True)
 class LoadedResult:
-    """The arrays of a finished run, see `load_result`."""
+    """The arrays of a finished run, as `load_result` returns them."""
 
     folder: Path  # the run's folder
     key: int  # frame number of the key sweep
@@ -111,9 +111,9 @@ def load_result(folder: str | Path) -> LoadedResult:
     with _damage_named(run.folder / "metrics.json"):
         metrics = read_json(run.folder / "metrics.json")
     depth = {}
-    for camera in run.cameras:
-        maps = run.maps(camera)
-        depth[camera] = LoadedMaps(
+    for name in run.chosen_maps:
+        maps = run.maps(name)
+        depth[name] = LoadedMaps(
             metres(maps["depth"]),
             metres(maps["depth_filled"]),
             confidence_of(maps["confidence"]),
@@ -126,7 +126,7 @@ class FinishedRun:
     """The folder of one densified key sweep. Files are read on demand and may raise InputError."""
 
     def __init__(self, folder: Path, thresholds: Thresholds = EVERYTHING) -> None:
-        """Open a folder with run.yaml, to read within ``thresholds``; InputError without it."""
+        """Open a run's folder to read within ``thresholds``. Raise InputError if it has no run."""
         path, problem = folder / "run.yaml", "no run.yaml in it"
         if (folder / "dataset.json").is_file():
             problem = (
@@ -149,13 +149,16 @@ class FinishedRun:
         self._min_confidence = stored_confidence(thresholds.min_confidence)
         max_age_ms = np.inf if thresholds.max_age_ms is None else thresholds.max_age_ms
         self._max_age = stored_age(max_age_ms / 1000)
-        # Camera -> measured, filled -> share of pixels, for the maps read so far
+        # Name of a map -> measured, filled -> share of pixels, for the maps read so far
         self.density: dict[str, dict[str, Kept]] = {}
         self._num_points: dict[Path, Kept] = {}
 
     @cached_property
-    def cameras(self) -> list[str]:
-        """The names of the chosen maps: CAMERA, or CAMERA/NUMBER of one image."""
+    def chosen_maps(self) -> list[str]:
+        """The names of the chosen cameras' depth maps: CAMERA, or CAMERA/NUMBER of one image.
+
+        Raise InputError if the run has no depth maps, or if a chosen camera is unknown.
+        """
         names = map_names(self.folder / "depth")
         if not names:
             raise InputError(f"{self.folder}: no depth maps in it; run densify with a camera first")
@@ -181,27 +184,27 @@ class FinishedRun:
         counts = self._num_points.values()
         return Kept(sum(k.before for k in counts), sum(k.after for k in counts)) if counts else None
 
-    def measure(self, camera: str) -> str:
+    def measure(self, name: str) -> str:
         """Return "z" if a map has depth along the camera's axis, "range" if from the lens."""
         path = self.folder / "metrics.json"
         with _damage_named(path):
-            return str(read_json(path)["measure"][camera])
+            return str(read_json(path)["measure"][name])
 
-    def require_z(self, camera: str) -> None:
+    def require_z(self, name: str) -> None:
         """Raise InputError unless a map has depth along the camera's axis."""
-        if self.measure(camera) != "z":
+        if self.measure(name) != "z":
             raise InputError(
-                f"{camera}: its depth is the range from the lens, and the form takes camera z; "
+                f"{name}: its depth is the range from the lens, and the form takes camera z; "
                 f"densify it with --set project.depth=z, or leave it out by naming the others with "
                 f"--camera"
             )
 
-    def jpeg(self, camera: str) -> bytes | None:
+    def jpeg(self, name: str) -> bytes | None:
         """Return the bytes of a map's image file, None if the run has no image."""
-        path = map_path(self.folder / "scene", "image", camera, ".jpg")
-        if camera not in self.scene.views or not path.is_file():
+        path = map_path(self.folder / "scene", "image", name, ".jpg")
+        if name not in self.scene.views or not path.is_file():
             return None
-        data, expected = read_bytes(path), self.scene.views[camera].camera
+        data, expected = read_bytes(path), self.scene.views[name].camera
         height, width = decode_image(data, path).shape[:2]
         if (width, height) != (expected.width_px, expected.height_px):
             raise InputError(
@@ -210,15 +213,16 @@ class FinishedRun:
             )
         return data
 
-    def maps(self, camera: str) -> dict[str, NDArray[Any]]:
-        """Return the (H,W) stored values of a camera's maps, 0 beyond a threshold.
+    def maps(self, name: str) -> dict[str, NDArray[Any]]:
+        """Return the stored values (H,W) of an image's maps, 0 beyond a threshold.
 
         The keys are depth, depth_filled, confidence and age, values of `densify.outputs.depth_png`.
-        This also enters the shares of pixels into ``density``.
+        This also enters the shares of pixels into ``density``. Raise InputError if a map is damaged
+        or does not belong to the others.
         """
         maps: dict[str, NDArray[Any]] = {}
         for kind, dtype in _KINDS.items():
-            path = map_path(self.folder, kind, camera)
+            path = map_path(self.folder, kind, name)
             maps[kind] = read_stored(path, dtype, f"a map of {kind}")
             is_same = maps[kind].shape == maps["depth"].shape
             if is_same and kind in ("confidence", "age"):
@@ -226,16 +230,16 @@ class FinishedRun:
             if not is_same:
                 raise InputError(f"{path}: does not belong to the others; densify the key again")
         keep = (maps["confidence"] >= self._min_confidence) & (maps["age"] <= self._max_age)
-        self.density[camera] = {
+        self.density[name] = {
             product: Kept(float((maps[kind] > 0).mean()), float(((maps[kind] > 0) & keep).mean()))
             for product, kind in (("measured", "depth"), ("filled", "depth_filled"))
         }
         return {kind: stored * keep for kind, stored in maps.items()}
 
-    def full_m(self, camera: str) -> Float32:
-        """Return (H,W) filled depth in metres, completed with a prior if there is one, 0 none."""
-        stored = self.maps(camera)["depth_filled"]
-        path = map_path(self.folder, "depth_full", camera)
+    def full_m(self, name: str) -> Float32:
+        """Return filled depth (H,W) in metres, completed with the prior if any, 0 for none."""
+        stored = self.maps(name)["depth_filled"]
+        path = map_path(self.folder, "depth_full", name)
         if path.is_file():
             full = read_stored(path, np.uint16, "a map of depth_full")
             stored = np.where(stored > 0, stored, full)
@@ -246,7 +250,7 @@ class FinishedRun:
         return self._read(self.folder / "cloud.laz")
 
     def whole_cloud(self) -> StoredCloud:
-        """Return `cloud` and the points of separated objects (``movers=separate``) after it."""
+        """Return `cloud`, followed by the points of separated objects (``movers=separate``)."""
         movers = sorted(self.folder.glob("movers/*/cloud.laz"))
         return joined_rows([self.cloud(), *map(self._read, movers)])
 
@@ -260,7 +264,7 @@ class FinishedRun:
 
 
 def finished_runs(folder: Path, thresholds: Thresholds = EVERYTHING) -> list[FinishedRun]:
-    """Return the run in a folder, else those up to two levels below, by parent folder and key."""
+    """Return the run in a folder, else the runs up to two levels below, by parent and key."""
     paths = [path for depth in ("*", "*/*") for path in folder.glob(f"{depth}/run.yaml")]
     folders = sorted(path.parent for path in paths)
     if (folder / "run.yaml").is_file() or not folders:
@@ -297,7 +301,7 @@ def map_names(*folders: Path) -> list[str]:
 
 
 def read_scene(path: Path) -> SceneFile:
-    """Return the content of scene.json; raise InputError if it is damaged."""
+    """Return the content of scene.json. Raise InputError if it is damaged."""
     with _damage_named(path):
         table = read_json(path)
         T_key_lidar = {sweep["frame"]: sweep["T_key_lidar"] for sweep in table["sweeps"]}
@@ -309,7 +313,7 @@ def read_scene(path: Path) -> SceneFile:
 
 
 def read_tracks(path: Path) -> list[ObjectTrack]:
-    """Return the tracks of moving objects in movers.json; raise InputError if it is damaged."""
+    """Return the tracks of moving objects in movers.json. Raise InputError if it is damaged."""
     with _damage_named(path):
         table = read_json(path)
         tracks = [_track(entry) for entry in table["objects"]]
@@ -365,7 +369,7 @@ def _track(entry: Mapping[str, Any]) -> ObjectTrack:
 
 
 def _array(value: Any, *shape: int) -> Float:
-    """Return an array of finite numbers of this shape; raise ValueError for any other."""
+    """Return an array of finite numbers of this shape. Raise ValueError for any other."""
     array = np.array(value, np.float64)
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"expected {' x '.join(map(str, shape))} numbers")
@@ -397,7 +401,7 @@ def export_run(
     cameras: Sequence[str] | None = None,
     overwrite: bool = False,
 ) -> Export:
-    """Write a finished run in another format, from its files alone; return what was written.
+    """Write a finished run in another format, from its files alone, and return what was written.
 
     Args:
         run: Folder of one key sweep, or of several for formats of whole drives.
@@ -405,7 +409,7 @@ def export_run(
         out: Folder to write into, None for ``RUN/export/FORMAT``.
         min_confidence: Least confidence of pixels and points, 0 to 1.
         max_age_ms: Greatest time from the measurement to the exposure (pixels) or the key sweep
-            (points); None for any.
+            (points), None for any.
         cameras: Names of the cameras, None for all.
         overwrite: True to replace an earlier export.
 
@@ -445,7 +449,7 @@ def export_run(
 
 
 def facts(export: Export) -> dict[str, Any]:
-    """Return the known ones of the fields ``density`` and ``num_points`` of export.yaml."""
+    """Return the fields ``density`` and ``num_points`` of export.yaml, without unknown ones."""
     density = {
         camera: {product: kept._asdict() for product, kept in products.items()}
         for camera, products in export.density.items()
@@ -477,12 +481,12 @@ def save_exr(path: Path, channel: str, values: Float32) -> None:
 
 
 def _maps(run: FinishedRun, folder: Path, suffix: str) -> Iterator[tuple[Path, str, Float32]]:
-    """Yield path, kind and (H,W) values of the three maps of each camera."""
-    for camera in run.cameras:
-        maps = run.maps(camera)
+    """Yield the path to write, the kind and the values (H,W) of the three maps of each image."""
+    for name in run.chosen_maps:
+        maps = run.maps(name)
         for kind in ("depth", "depth_filled", "confidence"):
             values = (confidence_of if kind == "confidence" else metres)(maps[kind])
-            yield map_path(folder, kind, camera, suffix), kind, values
+            yield map_path(folder, kind, name, suffix), kind, values
 
 
 def write_ply(run: FinishedRun, folder: Path) -> None:

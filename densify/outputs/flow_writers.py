@@ -43,8 +43,9 @@ def flow_writer(
 ) -> Iterator[FlowWriter]:
     """Yield a function that writes the flow of one sweep, a `FlowWriter`.
 
-    ``form`` is npz, av2, opensceneflow, semantickitti or doc-depth. ``frames``, of the sweeps to
-    write, ascend. Raise InputError if files exist in ``out``, unless ``overwrite`` replaces them.
+    ``form`` is npz, av2, opensceneflow, semantickitti or doc-depth. ``frames`` are the sweeps to
+    write, ascending. Raise InputError if files exist in ``out``, unless ``overwrite`` replaces
+    them.
     """
     paths = {frame: _path_of(form, sequence, out, frame) for frame in frames}
     if form == "av2":
@@ -66,7 +67,7 @@ def flow_writer(
         def write(frame: int, flow: StretchFlow) -> Path:
             path = paths[frame]
             T_world_lidar[frame] = _chained_pose(T_world_lidar, frame, flow.stretch)
-            # Without the last sweep's flow to the previous sweep
+            # These formats have flow forward in time. The last sweep's goes to the previous sweep.
             steps = {step: field for step, field in flow.steps.items() if step[0] < step[1]}
             to_next = StretchFlow(flow.stretch, steps)
             if form == "opensceneflow":
@@ -87,7 +88,7 @@ def flow_writer(
 
 
 def _path_of(form: str, sequence: LidarSequence, out: Path, frame: int) -> Path:
-    """Return the path of the file with a sweep's flow. As npz, the last sweep's is not written."""
+    """Return the path of the file with a sweep's flow, which as npz the last sweep never has."""
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in sequence.name)
     if form == "av2":
         return out / name / f"{sequence.stamp_ns(frame)}.feather"
@@ -132,15 +133,16 @@ def flow_npz(field: FlowField, **more_arrays: Any) -> bytes:
 
 
 def _total_flow(flow: StretchFlow, frame: int, target: int) -> np.ndarray:
-    """Return the (N,3) flow in metres from sweep ``frame`` to sweep ``target``, with ego-motion."""
-    # Position in the lidar frame of target at its reference time, minus position as measured.
+    """Return the flow (N,3) in metres, with ego-motion, from sweep ``frame`` to ``target``."""
+    # total = T_target_source (p + motion) - p, with the motion in the source's lidar frame
     points, field = flow.stretch[frame].sweep.points, flow.steps[frame, target]
     T = flow.stretch.T_target_source(target, frame)
     return poses.transform(T, points + field.total) - points
 
 
 def _chained_pose(earlier: dict[int, Float], frame: int, stretch: Stretch) -> Float:
-    """Return the (4,4) world pose of a sweep, chained to the last of the ``earlier`` ones."""
+    """Return the (4,4) world pose of a sweep, chained to the latest of the ``earlier`` sweeps."""
+    # Each stretch has a world of its own, and shares a sweep with an earlier stretch, or begins.
     previous = next((f for f in reversed(earlier) if f in stretch.frames), None)
     if previous is None:
         return stretch[frame].T_world_lidar

@@ -68,7 +68,11 @@ def default_folder(recording: str) -> Path:
 
 
 def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = ()) -> None:
-    """Raise InputError if a folder holds results of another recording, by `is_same`."""
+    """Raise InputError if results in ``out`` are of another recording.
+
+    The first and the last key, the ``keys`` to be written, and the first file of flow are tested.
+    ``data`` is the recording's text of ``--data``.
+    """
     for result in _stored_results(out, keys):
         if not any(is_same(recording, data, *stored) for _, *stored in result):
             path, stored_recording, stored_data = result[0]
@@ -80,7 +84,7 @@ def check_recording(out: Path, recording: str, data: str, keys: Iterable[int] = 
 
 
 def is_same(recording: str, data: str, stored_recording: str, stored_data: str) -> bool:
-    """Return True if two pairs of a name and ``--data`` mean one recording, perhaps moved."""
+    """Return True if two pairs of name and ``--data`` mean one recording, which may have moved."""
     if drive_folder(recording) != drive_folder(stored_recording):
         return False
     path, stored_path = (Spec.parse(text).path.resolve() for text in (data, stored_data))
@@ -93,9 +97,10 @@ def is_same(recording: str, data: str, stored_recording: str, stored_data: str) 
 def _stored_results(out: Path, keys: Iterable[int]) -> Iterator[list[_Stored]]:
     """Yield the recordings of each result in a folder: a training set, keys, files of flow."""
     path = out / "dataset.json"
-    if drives := _mapping(_content(path).get("drives")):
+    if drives := mapping_or_empty(_content(path).get("drives")):
         yield [
-            (path, name, str(_mapping(drive).get("data") or "")) for name, drive in drives.items()
+            (path, name, str(mapping_or_empty(drive).get("data") or ""))
+            for name, drive in drives.items()
         ]
     folders = sorted(path for path in out.glob("[0-9]*") if path.is_dir())
     # The first key, the last one, and those to be written
@@ -110,15 +115,17 @@ def _stored_results(out: Path, keys: Iterable[int]) -> Iterator[list[_Stored]]:
 
 
 def _content(path: Path) -> Mapping[str, Any]:
-    """Return the mapping in a YAML or JSON file, {} if it is missing or damaged."""
+    """Return the mapping in a YAML or JSON file, or {} for a missing or damaged file."""
     with suppress(InputError):
         if path.is_file():
-            return _mapping(read_yaml(path)[0] if path.suffix == ".yaml" else read_json(path))
+            return mapping_or_empty(
+                read_yaml(path)[0] if path.suffix == ".yaml" else read_json(path)
+            )
     return {}
 
 
-def _mapping(value: Any) -> Mapping[str, Any]:
-    """Return a value if it is a mapping, else an empty one."""
+def mapping_or_empty(value: Any) -> Mapping[str, Any]:
+    """Return a value that is a mapping, or {} for another value."""
     return value if isinstance(value, Mapping) else {}
 
 
@@ -219,7 +226,7 @@ def plain(value: Any) -> Any:
 
 @contextmanager
 def writing(folder: Path, owned: Collection[str], out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield the `staged_folder` if entries ``owned`` can be written; else raise InputError."""
+    """Yield the `staged_folder` for the entries ``owned``, after the checks of `check_folder`."""
     check_folder(folder, owned, out, overwrite)
     with staged_folder(folder, owned) as staging:
         yield staging

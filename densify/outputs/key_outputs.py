@@ -82,7 +82,7 @@ def write_comparison(
     data: str,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write compare.json, compare.png and the last method's ``compare/``; return the paths.
+    """Write compare.json, compare.png and the last method's ``compare/``, and return the paths.
 
     ``results`` has method -> result. The other arguments are those of `write_result`.
     """
@@ -239,7 +239,7 @@ def _write_scene(result: Result, folder: Path) -> None:
             write_depth_png(map_path(scene, method, name), baseline.depth[name].depth_m)
         if name in result.truth_m:
             write_depth_png(map_path(scene, "truth", name), result.truth_m[name])
-        # Frame number -> 1 + index of the sweep; the last entry, for frame -1, is 0.
+        # Frame number -> 1 + index of the sweep. Frame -1, no sweep, takes the last entry, 0.
         lookup = np.zeros(max(row_of) + 2, np.uint16)
         lookup[[*row_of]] = 1 + np.arange(len(row_of))
         write_file(map_path(scene, "sweep", name), encode_png(lookup[maps.frame]))

@@ -76,7 +76,7 @@ def write_kitti(runs: Sequence[FinishedRun], folder: Path) -> None:
         if not run.recording:
             raise InputError(f"{run.folder}/run.yaml: recording: expected the recording's name")
         drive = folder / split_of(run.recording) / drive_folder(run.recording)
-        for map_name in run.cameras:
+        for map_name in run.chosen_maps:
             entries += _write_map(run, map_name, drive, folder)
     lines = [f"{entry['rgb']} {entry['depth']} {entry['depth_filled']}\n" for entry in entries]
     write_file(folder / "files.txt", "".join(lines).encode())
@@ -126,8 +126,8 @@ def write_kitti_tracking(runs: Sequence[FinishedRun], folder: Path) -> None:
 
 
 def _write_frame(run: FinishedRun, objects: _Objects, folder: Path, sequence: str) -> list[str]:
-    """Write the files of a key, and return its label lines; ``sequence`` is the sequence's name."""
-    file, map_name = f"{run.key:06d}", run.cameras[0]
+    """Write the files of a key in the sequence of this name, and return the key's label lines."""
+    file, map_name = f"{run.key:06d}", run.chosen_maps[0]
     view = run.scene.views[map_name]
     if not view.camera.is_rectified:
         raise InputError(
@@ -158,7 +158,7 @@ def _write_frame(run: FinishedRun, objects: _Objects, folder: Path, sequence: st
 
 
 def _measured_pose(track: ObjectTrack, key: int, cloud: StoredCloud) -> Float:
-    """Return ``T_key_object`` (4,4) where the key sweep, whose points these are, measured it."""
+    """Return ``T_key_object`` (4,4) at the place where the key sweep, ``cloud``, measured it."""
     T_key_object = track.T_key_object[track.frames.index(key)].copy()
     of_track = cloud.moving & (cloud.instance == track.instance)
     if of_track.any():
@@ -167,7 +167,7 @@ def _measured_pose(track: ObjectTrack, key: int, cloud: StoredCloud) -> Float:
 
 
 def _label(size_m: Float, T_cam_object: Float, view: CameraView) -> str:
-    """Return type and values of an object's label line, "" if it is out of view."""
+    """Return type and values of an object's label line, or "" for an object out of view."""
     corners = poses.transform(T_cam_object, corners_of(size_m))
     if (corners[:, 2] < cameras.NEAREST_M).any():
         return ""
@@ -179,11 +179,12 @@ def _label(size_m: Float, T_cam_object: Float, view: CameraView) -> str:
     truncated = int((low < 0).any() or (high > last_px).any())
     x, y, z = T_cam_object[:3, 3]
     length_m, width_m, height_m = size_m
-    turn = -np.arctan2(T_cam_object[2, 0], T_cam_object[0, 0])
-    alpha = (turn - np.arctan2(x, z) + np.pi) % (2 * np.pi) - np.pi
+    turn_rad = -np.arctan2(T_cam_object[2, 0], T_cam_object[0, 0])
+    # KITTI's alpha is the heading as seen from the camera, from -pi to pi.
+    alpha_rad = (turn_rad - np.arctan2(x, z) + np.pi) % (2 * np.pi) - np.pi
     box_px = [*np.clip(low, 0, last_px), *np.clip(high, 0, last_px)]
     bottom = [x, y + height_m / 2, z]
-    values = [alpha, *box_px, height_m, width_m, length_m, *bottom, turn]
+    values = [alpha_rad, *box_px, height_m, width_m, length_m, *bottom, turn_rad]
     text = " ".join(f"{value:.6f}" for value in values)
     return f"{_type_of(size_m)} {truncated} {_UNKNOWN} {text}"
 
@@ -218,12 +219,13 @@ def _earlier_numbers(
 ) -> dict[int, int]:
     """Return index of a track of the run -> number of the same object in earlier keys."""
     candidates: list[tuple[float, int, int]] = []
-    for earlier_run, objects in keys:  # tracks must overlap in time and space
+    # Pairs of tracks nearer than half the smaller box are joined, the nearest pair first.
+    for earlier_run, objects in keys:
         T_now, T_then = run.scene.T_key_lidar, earlier_run.scene.T_key_lidar
         shared = sorted(T_now.keys() & T_then.keys())
         if not shared:
             continue
-        frame = shared[len(shared) // 2]
+        frame = shared[len(shared) // 2]  # about midway between the keys
         T_run_key = T_now[frame] @ poses.inverse(T_then[frame])
         for row, track in enumerate(run.tracks):
             for number, earlier in objects.items():
@@ -239,7 +241,7 @@ def _earlier_numbers(
 
 
 def _distance_m(track: ObjectTrack, earlier: ObjectTrack, T_track_earlier: Float) -> float:
-    """Return the median distance seen from above of two tracks in common sweeps, inf for none."""
+    """Return the median distance of two tracks in common sweeps, from above, inf for no sweep."""
     frames = sorted({*track.frames} & {*earlier.frames})
     if not frames:
         return np.inf
@@ -252,17 +254,17 @@ def _distance_m(track: ObjectTrack, earlier: ObjectTrack, T_track_earlier: Float
 
 
 def _sized(track: ObjectTrack, of_object: Sequence[ObjectTrack]) -> ObjectTrack:
-    """Return a track with the length and width that its object has in all keys (``of_object``)."""
+    """Return a track with the length and width that its object has in all keys."""
     # The size is the median over keys that observed both ends, else that of the longest box. A side
-    # that was observed keeps its position; without such a side both ends grow by half.
+    # that was observed keeps its position. Without such a side both ends grow by half.
     for axis, ends in enumerate(_ENDS):
         complete_m = [other.size_m[axis] for other in of_object if {*ends} <= {*other.sides_seen}]
         longest_m = max(float(other.size_m[axis]) for other in of_object)
         size_m = float(np.median(complete_m)) if complete_m else longest_m
         missing_m = size_m - track.size_m[axis]
         is_unseen = np.array([end not in track.sides_seen for end in ends])
-        share = is_unseen if is_unseen.sum() == 1 else np.array([0.5, 0.5])
-        track = grow_box(track, axis, *(missing_m * share))
+        parts = is_unseen if is_unseen.sum() == 1 else np.array([0.5, 0.5])
+        track = grow_box(track, axis, *(missing_m * parts))
     return track
 
 

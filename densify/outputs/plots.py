@@ -72,7 +72,7 @@ def order_front_first(
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write a figure of each method's depth, and the prior's, ahead; nothing without maps."""
+    """Write a figure of each method's and the prior's depth ahead, or nothing without maps."""
     method, last = list(results.items())[-1]
     if not last.depth:
         return
@@ -120,7 +120,11 @@ def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
 
 
 def depth_over_image(image: Picture, depth_m: Float32) -> Picture:
-    """Return the (H,W,3) colours, as blue, green, red, of depth over an RGB image in dark gray."""
+    """Return the picture (H,W,3), as blue, green, red, of depth over a dark gray image.
+
+    ``image`` (H,W,3) is RGB. ``depth_m`` (H,W) is in metres, coloured by `colour_depth`, 0 for
+    none.
+    """
     gray = (_BRIGHTNESS * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8)
     picture = cv2.merge([gray, gray, gray]).astype(np.uint8, copy=False)
     picture[depth_m > 0] = colour_depth(depth_m)[depth_m > 0]
@@ -128,7 +132,7 @@ def depth_over_image(image: Picture, depth_m: Float32) -> Picture:
 
 
 def colour_depth(depth_m: Float32) -> Picture:
-    """Return the (h,w,3) colours, as blue, green, red, of depths (h,w) in metres; 0 is black."""
+    """Return the colours (h,w,3), as blue, green, red, of depths (h,w) in metres, black for 0."""
     share = np.log(np.maximum(depth_m, _NEAR_M) / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
     levels = np.rint(255 * (1 - np.minimum(share, 1))).astype(np.uint8)
     picture = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO).astype(np.uint8, copy=False)

@@ -27,7 +27,7 @@ from densify.geometry.types import Bool, Float, Int, ObjectTrack
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import PixelType, read_stored
 from densify.outputs.finished_run import map_names, read_scene, read_tracks
-from densify.outputs.folders import plain
+from densify.outputs.folders import mapping_or_empty, plain
 from densify.outputs.plots import order_front_first
 from densify.readers.decoded_files import decode_image
 from densify.version import __version__
@@ -70,31 +70,30 @@ class KeyFiles:
 
     @staticmethod
     def of_run(folder: Path) -> KeyFiles:
-        """Return the files of a run; raise InputError without a readable run.yaml."""
-        files = KeyFiles(folder, _mapping(read_yaml(folder / "run.yaml")[0]), {})
-        metrics = _mapping(files.read(read_json, "metrics.json"))
+        """Return the files of a run. Raise InputError without a readable run.yaml."""
+        files = KeyFiles(folder, mapping_or_empty(read_yaml(folder / "run.yaml")[0]), {})
+        metrics = mapping_or_empty(files.read(read_json, "metrics.json"))
         method = str(files.about.get("method", "run"))
-        files.methods = {**_mapping(metrics.get("baselines")), method: metrics}
+        files.methods = {**mapping_or_empty(metrics.get("baselines")), method: metrics}
         return files
 
     @staticmethod
     def of_comparison(folder: Path) -> KeyFiles:
         """Return the files of a comparison. Raise InputError unless compare.json is whole."""
-        about = _mapping(read_json(folder / "compare.json"))
+        about = mapping_or_empty(read_json(folder / "compare.json"))
         methods = {
-            str(method): _mapping(scores)
-            for method, scores in _mapping(about.get("methods")).items()
+            str(method): mapping_or_empty(scores)
+            for method, scores in mapping_or_empty(about.get("methods")).items()
         }
         if not methods:
             raise InputError(f"{folder}/compare.json: names no methods; compare the key again")
         return KeyFiles(folder / "compare", about, methods)
 
     def read(self, read: Callable[[Path], T], name: str, optional: bool = False) -> T | None:
-        """Read a file of the folder; None, with a note in ``missing``, if it cannot be read.
+        """Return what ``read`` makes of a file in the folder, or None for an unreadable file.
 
-        Args:
-            read: Function that returns the content of a path.
-            optional: True to return None without a note if the file does not exist.
+        A file that cannot be read is noted in ``missing``, unless ``optional`` and it does not
+        exist.
         """
         path = self.maps / name
         if optional and not path.is_file():
@@ -106,7 +105,7 @@ class KeyFiles:
             return None
 
     def camera(self, name: str) -> dict[str, NDArray[Any]]:
-        """Return the (H,W) stored values of a camera's maps, by `_MAPS` kind or baseline name."""
+        """Return the stored values (H,W) of a camera's maps, by `_MAPS` kind or baseline name."""
         maps: dict[str, NDArray[Any]] = {}
         maps_of_methods = {f"scene/{method}": np.uint16 for method in self.methods}
         for folder, pixel_type in {**_MAPS, **maps_of_methods}.items():
@@ -124,11 +123,6 @@ def _jpeg(path: Path) -> bytes:
     """Return the bytes of an image file that can be decoded."""
     decode_image(data := read_bytes(path), path)
     return data
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    """Return a value if it is a table, else an empty one."""
-    return value if isinstance(value, dict) else {}
 
 
 def key_page(files: KeyFiles, shown_folder: str) -> bytes:
@@ -271,7 +265,8 @@ def pack_cloud(
     rows = thin_cloud(cloud.points, cloud.moving, _MOST_POINTS)
     chosen = cloud.select(rows[np.argsort(~cloud.moving[rows], kind="stable")])
     low = chosen.points.min(axis=0, initial=0.0)
-    step_m = float(max((chosen.points - low).max(initial=0.0), 1e-3) / _MAX_UINT16)
+    size_m = max((chosen.points - low).max(initial=0.0), 1e-3)  # above 0 for a single point
+    step_m = float(size_m / _MAX_UINT16)
     positions = np.rint((chosen.points - low) / step_m)
     num_moving = int(chosen.moving.sum())
     movers = _numbers(chosen.instance, [-1, *instances]) + 1
@@ -295,9 +290,11 @@ def pack_cloud(
 
 
 def thin_cloud(points: Float, moving: Bool, max_points: int) -> Int:
-    """Return (K,) ascending indices of ``max_points`` points at most, mostly far or moving ones."""
+    """Return at most ``max_points`` ascending indices (K,), mostly of far or moving points."""
     if len(points) <= max_points:
         return np.arange(len(points))
+    # Near points are dense: their weight falls with the squared range. Exponential variables over
+    # the weights, sorted, draw points without replacement.
     weight = np.maximum((points**2).sum(axis=1), _NEAR_M**2)
     weight[moving] *= _MOVING_WEIGHT
     order = np.argsort(np.random.default_rng(0).exponential(size=len(points)) / weight)
@@ -305,7 +302,7 @@ def thin_cloud(points: Float, moving: Bool, max_points: int) -> Int:
 
 
 def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
-    """Return (N,3) colours of 64 levels, gray by reflectance where no camera observed the point."""
+    """Return colours (N,3) of 64 levels, gray by reflectance for points that no camera observed."""
     dark, bright = _GRAY
     gray = dark + (bright - dark) * np.sqrt(np.clip(cloud.intensity, 0, 1))
     rgb = np.where(cloud.observed[:, None], cloud.rgb, gray[:, None]).astype(np.uint8)
@@ -313,7 +310,7 @@ def _colours(cloud: StoredCloud) -> NDArray[np.uint8]:
 
 
 def _numbers(values: NDArray[np.int32], known: Sequence[int]) -> Int:
-    """Return the index of each value (N,) in the list ``known``, 0 for unknown values."""
+    """Return the index of each value (N,) in the list ``known``, or 0 for an unknown value."""
     number_of = {value: number for number, value in enumerate(known)}
     return np.array([number_of.get(value, 0) for value in values.tolist()], np.int64)
 

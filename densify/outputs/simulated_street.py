@@ -53,9 +53,11 @@ def write_street(
 
     Args:
         format: ``kitti`` or ``folder``.
+        street: The street.
         out: Folder in which the recording's folder is made.
         frames: Frame numbers of the sweeps, in any order.
         cameras: Names of the cameras, None for all.
+        progress: Function that is called with the progress, None for none.
         overwrite: True to replace existing files, which else raise InputError.
     """
     if format not in FORMATS:
@@ -67,8 +69,9 @@ def write_street(
             f"{street.name}: cannot be written as KITTI, whose points have neither a time nor a "
             f"scanner; choose a single scanner that spins: {', '.join(fit)}"
         )
-    for name in excerpt.cameras if is_kitti else ():
-        checks.camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
+    if is_kitti:  # KITTI's cameras alone have a place in its calibration file
+        for name in excerpt.cameras:
+            checks.camera_named({usual: CAMERAS[usual] for usual in USUAL}, name, out)
     folder, owned = (out / _DATE, _KITTI) if is_kitti else (out / "street", _FOLDER)
     for name in owned:
         if (folder / name).exists() and not overwrite:
@@ -91,7 +94,7 @@ class Excerpt:
     def of(
         cls, street: Street, frames: Sequence[int], cameras: Sequence[str] | None = None
     ) -> Excerpt:
-        """Return the excerpt of these frames and cameras, None for all; InputError if unknown."""
+        """Return the excerpt of these frames and cameras (None: all), or raise InputError."""
         names = tuple(street.cameras if cameras is None else cameras)
         for name in names:
             checks.camera_named(street.cameras, name, Path(street.name))
@@ -116,19 +119,19 @@ class Excerpt:
         return encode_png(self.street.image(camera, number)[:, :, ::-1])
 
     def T_world_ego(self, stamp_ns: Int, T_lidar_ego: Float | None = None) -> Float:
-        """Return the (n,4,4) true poses of an ego frame, None for the lidar, at (n,) times (ns)."""
+        """Return the true poses (n,4,4) of an ego frame (None: the lidar) at (n,) times in ns."""
         T_world_lidar = [self.street.simulator.T_world_lidar_at(int(ns)) for ns in stamp_ns]
         return np.stack(T_world_lidar) @ (np.eye(4) if T_lidar_ego is None else T_lidar_ego)
 
     def poses(self, T_lidar_ego: Float | None = None) -> PoseTrack:
-        """Return the true poses of an ego frame every 5 ms. ``T_lidar_ego`` as in `T_world_ego`."""
+        """Return the true poses of an ego frame every 5 ms, as a track. None takes the lidar."""
         first_ns, last_ns = (self.street.stamp_ns(f) for f in (self.frames[0], self.frames[-1]))
         stamp_ns = np.arange(first_ns - _MARGIN_NS, last_ns + _MARGIN_NS + 1, _POSE_STEP_NS)
         return PoseTrack(self.street.name, stamp_ns, self.T_world_ego(stamp_ns, T_lidar_ego))
 
 
 def put(path: Path, data: bytes | str) -> None:
-    """Write a file and make its parent folders."""
+    """Write a file, and make its parent folders."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data.encode() if isinstance(data, str) else data)
 
@@ -257,7 +260,8 @@ def numbers(values: Float) -> str:
 def projections(key: str) -> str:
     """Return the calibration lines of cameras 0 to 3 with label ``key``, such as ``P_rect_0{}``.
 
-    A line is K [I | t], with t in metres from the rectified camera 0.
+    A line has P = K [I | t], where t is the position of rectified camera 0 in the camera's frame in
+    metres.
     """
     lines = ""
     for number in range(4):  # gray cameras 0 and 1 share the poses of colour cameras 2 and 3
@@ -290,8 +294,9 @@ def T_lidar_imu(tilt_deg: float) -> Float:
 
 
 def oxts_line(street: Street, frame: int, first: int) -> str:
-    """Return the oxts line with the true pose of the inertial unit at a frame; velocities are 0."""
-    # Readers take the Mercator scale from the latitude of frame ``first``, which is fixed.
+    """Return the oxts line of a frame: the inertial unit's true pose, and velocities of 0."""
+    # Inverse of KITTI's projection, whose scale readers take from the latitude of frame ``first``:
+    # x = scale lon, y = scale ln tan((90 deg + lat) / 2)
     T_lidar_ego = T_lidar_imu(street.simulator.tilt_deg)
     T_world_now, T_world_first = (
         street.simulator.T_world_lidar_at(street.stamp_ns(f)) @ T_lidar_ego for f in (frame, first)

@@ -76,7 +76,7 @@ class Timeline(NamedTuple):
 
 
 def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
-    """Yield the content for viewers: of one run all sweeps, of several runs their key sweeps."""
+    """Yield the content for viewers: all sweeps of a single run, the key sweeps of several runs."""
     for T_world_key, run in zip(key_poses(runs), runs, strict=True):
         cloud, sweeps = run.cloud(), []
         for sweep in run.scene.table["sweeps"]:
@@ -85,7 +85,7 @@ def timelines(runs: Sequence[FinishedRun]) -> Iterator[Timeline]:
                 stamp_ns = run.stamp_ns + round(_NS * (since_s or 0.0))
                 points, boxes = cloud.sweep(frame), _boxes_at(run.tracks, frame)
                 sweeps.append(ShownSweep(frame, stamp_ns, np.array(T), points, boxes))
-        shots = [_shot(run, name) for name in run.scene.views if name in run.cameras]
+        shots = [_shot(run, name) for name in run.scene.views if name in run.chosen_maps]
         yield Timeline(run.key, T_world_key, cloud, sweeps, shots, run.tracks)
 
 
@@ -193,7 +193,7 @@ class _FoxgloveMessages:
         )
 
     def _boxes(self, stamp_ns: int, boxes: Sequence[ShownBox]) -> Any:
-        """Return the message of boxes. It replaces all earlier boxes."""
+        """Return the message of all boxes at a time, which replaces earlier boxes."""
         schemas, stamp, entities = self._schemas, self._stamp(stamp_ns), []
         for box in boxes:
             cube = schemas.CubePrimitive(
@@ -244,14 +244,14 @@ def _ros_lens(camera: Camera) -> dict[str, Any]:
 
 
 def write_rrd(runs: Sequence[FinishedRun], folder: Path) -> None:
-    """Write ``recording.rrd``; the bytes differ each time, as rerun numbers chunks by the clock."""
+    """Write ``recording.rrd``, whose bytes always differ: rerun numbers chunks by the clock."""
     with _rerun_stream(runs) as stream:
         stream.save(folder / "recording.rrd")
         _log_to_rerun(stream, runs)
 
 
 def show_in_rerun(runs: Sequence[FinishedRun]) -> None:
-    """Show the runs in rerun's viewer, which stays open; raise InputError without the package."""
+    """Show the runs in rerun's viewer, which stays open. Raise InputError without rerun."""
     with _rerun_stream(runs) as stream:
         stream.spawn()
         _log_to_rerun(stream, runs)
@@ -364,7 +364,7 @@ def write_mp4(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write ``video/CAMERA.mp4`` with a frame for each map, in the order of runs and images."""
     shots: dict[str, list[tuple[FinishedRun, str]]] = {}
     for run in runs:
-        for name in run.cameras:
+        for name in run.chosen_maps:
             shots.setdefault(name.partition("/")[0], []).append((run, name))
     (folder / "video").mkdir()
     for camera, of_camera in shots.items():

@@ -26,7 +26,7 @@ class ReaderModule(Protocol):
     """Interface of a reader's module, which also has the ``recognises`` of `Plugin`."""
 
     def open_recording(self, path: Path, scene: str | None) -> LidarSequence:
-        """Return the recording at a path; ``scene`` is the text after ``#``, None without it."""
+        """Return the recording at a path, or its part ``scene``, the text after ``#``."""
         ...
 
 
@@ -51,8 +51,7 @@ class Spec(NamedTuple):
         name, colon, location = text.partition(":")
         reader = name if colon and name in READERS.names() else None
         location = text if reader is None else location
-        # A # in the path of an existing file is part of the path. Without READER: it also is if no
-        # file is named by the text before it.
+        # Without READER:, a # also belongs to the path if the text before the # names no file.
         path, mark, scene = location.rpartition("#")
         if not mark or _exists(location) or (reader is None and not _exists(path)):
             return Spec(reader, location)
@@ -77,7 +76,7 @@ def _exists(location: str) -> bool:
 
 
 def open_sequence(spec: str | Path = "street") -> LidarSequence:
-    """Return a recording; its sweeps and images are read later, on demand.
+    """Return a recording whose sweeps and images are read later, on demand.
 
     Args:
         spec: A path, ``READER:PATH[#SCENE]``, or ``street[:PRESET][?seed=N&sensor=NAME]`` for the
@@ -136,38 +135,39 @@ def _what_is_there(path: Path) -> str:
     if path.is_file():
         return f"it is a {path.suffix or 'file without a suffix'} file"
     counts = Counter(entry.suffix.lower() or "other" for entry in path.iterdir() if entry.is_file())
-    kinds = [(f"{suffix} file", num) for suffix, num in counts.most_common(3)]
+    kinds = [(f"{suffix} file", count) for suffix, count in counts.most_common(3)]
     kinds.append(("folder", sum(entry.is_dir() for entry in path.iterdir())))
-    contents = ", ".join(f"{num} {kind}{'s' * (num > 1)}" for kind, num in kinds if num)
+    contents = ", ".join(f"{count} {kind}{'s' * (count > 1)}" for kind, count in kinds if count)
     text = f"it holds {contents}, no lidar sweeps" if contents else "it is empty"
     drive = drive_around(path)
     return text if drive is None else f"{text}, and is inside a KITTI drive: give {drive}"
 
 
 def describe(sequence: LidarSequence) -> str:
-    """Return a summary of a recording as lines of text, the pairs of `findings`."""
+    """Return a summary of a recording as text, with a line for each pair of `findings`."""
     return align(findings(sequence))
 
 
 def align(lines: Sequence[tuple[str, str]]) -> str:
-    """Return (name, text) pairs as lines of text; all texts start in the same column."""
+    """Return (name, text) pairs as lines of text, where all texts start in the same column."""
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(f"{label:<{width}}{text}" for label, text in lines)
 
 
 def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
-    """Return a recording's summary as (name, text) pairs; raise InputError if no sweep is readable.
+    """Return a recording's summary as (name, text) pairs for people.
 
     The pairs give frames, rate, stamps, points, cameras, poses, truth and the reader's findings.
-    Points and stamps are those of the first and the last readable sweep.
+    Points and stamps are those of the first and the last readable sweep. Raise InputError if no
+    sweep is readable.
     """
     timeline = Timeline.of(sequence)
     unreadable = dict(timeline.unknown)
-    first = _readable(sequence, timeline.frames, unreadable)
-    last = _readable(sequence, timeline.frames[::-1], unreadable)
-    num_points = {sweep.frame: _num_points(sweep) for sweep in (first, last)}
-    named = sorted(unreadable)[:_MOST_NAMED]
-    length_s = (last.stamp_ns - first.stamp_ns) * 1e-9
+    first_sweep = _readable(sequence, timeline.frames, unreadable)
+    last_sweep = _readable(sequence, timeline.frames[::-1], unreadable)
+    num_points = {sweep.frame: _num_points(sweep) for sweep in (first_sweep, last_sweep)}
+    named_frames = sorted(unreadable)[:_MOST_NAMED]
+    begin_ns, end_ns = first_sweep.stamp_ns, last_sweep.stamp_ns
     frames = sequence.frames
     num_missing = frames[-1] - frames[0] + 1 - len(frames)
     gaps = f"{num_missing} missing between them" if num_missing else "no gaps"
@@ -175,24 +175,28 @@ def findings(sequence: LidarSequence) -> list[tuple[str, str]]:
         ("name", sequence.name),
         ("frames", f"{format_frames(frames)} ({len(frames)}, {gaps})"),
         ("rate", _hertz(timeline.stamp_ns) if len(timeline.frames) > 1 else "unknown, one sweep"),
-        ("stamps", f"{first.stamp_ns} to {last.stamp_ns} ns ({length_s:.2f} s)"),
+        ("stamps", f"{begin_ns} to {end_ns} ns ({(end_ns - begin_ns) * 1e-9:.2f} s)"),
         ("points", ", ".join(f"{num} in frame {f}" for f, num in num_points.items())),
-        ("point times", _point_times(first)),
+        ("point times", _point_times(first_sweep)),
         *_cameras(sequence),
         ("poses", _poses(sequence, [f for f in timeline.frames if f not in unreadable])),
         ("truth", "none" if sequence.truth is None else "exact, simulated"),
-        *(sequence.findings() if hasattr(sequence, "findings") else ()),
-        *((f"frame {frame}", f"cannot be used: {unreadable[frame]}") for frame in named),
     ]
-    if len(unreadable) > len(named):
-        unlisted = format_frames(unreadable.keys() - named)
+    if hasattr(sequence, "findings"):
+        lines += sequence.findings()
+    for frame in named_frames:
+        lines.append((f"frame {frame}", f"cannot be used: {unreadable[frame]}"))
+    if len(unreadable) > len(named_frames):
+        unlisted = format_frames(unreadable.keys() - named_frames)
         lines.append(("frames", f"cannot be used either: {unlisted}"))
     return lines
 
 
 def _readable(sequence: LidarSequence, frames: Sequence[int], unreadable: dict[int, str]) -> Sweep:
-    """Return the first readable sweep of ``frames``; add reasons of failures to ``unreadable``."""
-    for frame in (frame for frame in frames if frame not in unreadable):
+    """Return the first readable sweep of ``frames``, and note failures in ``unreadable``."""
+    for frame in frames:
+        if frame in unreadable:
+            continue
         try:
             return sequence[frame]
         except InputError as error:
@@ -245,6 +249,7 @@ def _poses(sequence: LidarSequence, frames: Sequence[int]) -> str:
         path = np.array([sequence.T_world_lidar(frame)[:3, 3] for frame in frames])
     except InputError as error:
         why = str(error).removeprefix(f"{getattr(sequence, 'where', None)}: ")
+        # That a reader has no poses is no news, and its remedy does not belong into a summary.
         return "none" if why.startswith("no poses") else f"none: {why}"
     length_m = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     return f"yes, a path of {length_m:.1f} m"

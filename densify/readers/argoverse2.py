@@ -39,7 +39,7 @@ _FX_FY_CX_CY = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 def open_recording(path: Path, scene: str | None) -> Argoverse2:
-    """Return the log in a folder; or the log ``scene`` of a split's or the data set's folder."""
+    """Return the log in a folder, or the log ``scene`` in the folder of a split or the data set."""
     if scene is None and (path / _TRACK).is_file():
         return Argoverse2(path)
     folders = (path, path / "train", path / "val", path / "test")
@@ -50,7 +50,7 @@ def open_recording(path: Path, scene: str | None) -> Argoverse2:
 
 
 class Argoverse2(FileSequence):
-    """An Argoverse 2 log in the vehicle's frame; the reference time of a sweep is its start."""
+    """An Argoverse 2 log in the vehicle's frame. The reference time of a sweep is its start."""
 
     def __init__(self, log: Path) -> None:
         sweeps = checks.numbered_files(log / "sensors" / "lidar", ".feather")
@@ -89,6 +89,7 @@ class Argoverse2(FileSequence):
         )
 
     def _returns(self, frame: int) -> Returns:
+        # Coordinates and intensity may be NaN ("m"), the numbers of lasers and ns are whole ("i").
         kinds = {**dict.fromkeys("xyz", "m"), "intensity": "m", "laser_number": "i"}
         columns = _read(self._files[frame], {**kinds, "offset_ns": "i"})
         offset_ns = columns["offset_ns"].astype(np.int64)
@@ -106,7 +107,7 @@ class Argoverse2(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the lidar frame; None without annotations of this sweep."""
+        """Return a sweep's boxes in the lidar frame, or None without annotations of this sweep."""
         path, columns = self.where / "annotations.feather", self._annotations
         stamp_ns = self.stamp_ns(frame)
         rows = np.flatnonzero(columns["timestamp_ns"] == stamp_ns) if columns else np.zeros(0, int)
@@ -132,12 +133,13 @@ class Argoverse2(FileSequence):
 def _read(
     path: Path, kinds: dict[str, str], numbers: tuple[str, ...] = ()
 ) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table: ``kinds`` as for `read_arrow`, ``numbers`` finite."""
     kinds = {**kinds, **dict.fromkeys(numbers, "n")}
     return read_arrow(path, kinds, ("argoverse", "Argoverse 2 recordings"))
 
 
 def _poses(columns: dict[str, NDArray[Any]], path: Path, rows: Int) -> Float:
-    """Return the (n,4,4) poses in these rows (n,) of the table."""
+    """Return the (n,4,4) poses in the rows with the indices ``rows`` (n,) of a table."""
     table = np.stack([columns[name] for name in _POSE], axis=1)
     T = [checks.quaternion_pose(table[r, :4], table[r, 4:], f"{path}: row {r}") for r in rows]
     return np.reshape(T, (-1, 4, 4))

@@ -28,11 +28,12 @@ def numbered_files(
 ) -> dict[int, Path]:
     """Return the numbered files of a folder, such as ``0000000120.bin``, by ascending number.
 
+    Raise InputError if two files of one suffix have the same number.
+
     Args:
         folder: Folder to search without its subfolders, or one file. It may be missing.
         *suffixes: Accepted suffixes. Of files with the same number, the earliest suffix is taken.
-            Two files of one suffix with the same number raise InputError.
-        stem: Pattern of a whole name without suffix; its first group is the number.
+        stem: Pattern of a whole name without suffix. The pattern's first group is the number.
     """
     entries = [folder] if folder.is_file() else folder.glob("*")
     files = [
@@ -52,7 +53,7 @@ def numbered_files(
 
 
 def file_within(root: Path, name: str, where: Path | str) -> Path:
-    """Return the path of ``name`` relative to ``root``; raise InputError if it leads out of it."""
+    """Return the path of ``name`` in the folder ``root``. Raise InputError if it leads outside."""
     path = root / name
     if not Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
         raise InputError(
@@ -62,13 +63,13 @@ def file_within(root: Path, name: str, where: Path | str) -> Path:
 
 
 def drive_around(path: Path) -> Path | None:
-    """Return the KITTI raw drive that contains a path at most two levels deep, None if none."""
+    """Return the KITTI raw drive that holds a path one or two levels below, None without one."""
     parents = path.absolute().parents[:2]
     return next((parent for parent in parents if (parent / "velodyne_points").is_dir()), None)
 
 
 def find_entry(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> T:
-    """Return the entry of a frame; without it, an InputError names ``where`` and ``kind``."""
+    """Return the entry of a frame. Raise InputError about ``kind`` and ``where`` without one."""
     if frame not in entries:
         raise InputError(
             f"{where}: no {kind} of frame {frame}; frames that exist: {format_frames(entries)}"
@@ -77,7 +78,7 @@ def find_entry(entries: Mapping[int, T], frame: int, kind: str, where: Path) -> 
 
 
 def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camera:
-    """Return the camera of a name; raise InputError, with the existing names, if it is unknown."""
+    """Return the camera of a name. Raise InputError, with the known names, for another name."""
     if name not in cameras:
         raise InputError(
             f"{where}: no camera {name!r}; cameras that exist: {', '.join(cameras) or 'none'}"
@@ -86,7 +87,7 @@ def camera_named(cameras: Mapping[str, Camera], name: str, where: Path) -> Camer
 
 
 def decode_rgb(data: bytes, camera: Camera, where: Path | str) -> NDArray[np.uint8]:
-    """Return an image file's bytes as (H,W,3) uint8 RGB; raise InputError if of another size."""
+    """Return the (H,W,3) uint8 RGB pixels of an image file's bytes, checked for their size."""
     bgr = decode_image(data, where)
     check_image_size(bgr.shape, camera, where)
     return np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8)
@@ -110,10 +111,10 @@ def pinhole(
     where: str,
     **lens: Any,
 ) -> Camera:
-    """Return a camera with zero skew; ``lens`` has further arguments of `Camera`.
+    """Return a camera with zero skew. ``lens`` has further arguments of `Camera`.
 
-    Raise InputError, whose message begins with ``where``, unless the focal lengths and sizes are
-    above 0.
+    Raise InputError, whose message begins with ``where``, if a number is not finite, or a focal
+    length or size is not above 0.
     """
     fx, fy, cx, cy = (float(value) for value in fx_fy_cx_cy)
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy, *size_px) > 0):
@@ -128,11 +129,11 @@ def pinhole(
 def chosen_scene(
     reader: str, path: Path, scene: str | None, names: Sequence[str], none: str
 ) -> str:
-    """Return the name of the requested or only scene; raise InputError if it is not clear.
+    """Return the name of the requested scene, or of the only scene. Else raise InputError.
 
     Args:
         reader, path: Name of the reader and path of the recordings, for messages.
-        scene: Name of the requested scene; None for the only scene.
+        scene: Name of the requested scene, None for the only scene.
         names: Names of the existing scenes.
         none: Message of the InputError if there are no scenes.
     """
@@ -155,7 +156,7 @@ def truth_beside(recording: Path) -> Truth | None:
 
 
 def parse_numbers(text: str, where: str, count: int) -> Float:
-    """Return a text of ``count`` finite numbers as (count,); raise InputError for others."""
+    """Return the ``count`` finite numbers in a text as (count,). Raise InputError otherwise."""
     try:
         values = np.array(text.split(), np.float64)
     except ValueError as error:
@@ -168,7 +169,7 @@ def parse_numbers(text: str, where: str, count: int) -> Float:
 
 
 def pose(T: Any, where: str) -> Float:
-    """Return a (4,4) rigid transform from (4,4), (3,4), or 16 or 12 numbers, row by row.
+    """Return a (4,4) rigid transform from (4,4), (3,4), or their 16 or 12 numbers, row by row.
 
     Raise InputError, whose message begins with ``where``, if a number is not finite, or the
     rotation is mirrored or not orthonormal to 0.001.
@@ -190,9 +191,12 @@ def pose(T: Any, where: str) -> Float:
 
 
 def scanner_axes(T_lidar_scanner: Float) -> Float:
-    """Return (S,3,3) rotations from lidar axes to scanner axes, of mounting poses (S,4,4)."""
+    """Return the (S,3,3) rotations from lidar axes to the axes of each scanner, z up.
+
+    ``T_lidar_scanner`` are the mounting poses (S,4,4). The axes of a scanner that is mounted upside
+    down are turned by 180 degrees about its x axis.
+    """
     R = T_lidar_scanner[:, :3, :3]
-    # The axes of a scanner mounted upside down are turned by 180 degrees about x, so that z is up.
     upright = np.where(R[:, 2:, 2:] < 0, R * [1.0, -1.0, -1.0], R)
     return np.ascontiguousarray(upright.transpose(0, 2, 1))
 
@@ -202,8 +206,8 @@ def quaternion_pose(
 ) -> Float:
     """Return the (4,4) pose of a unit quaternion, scalar first, and a translation in metres.
 
-    Raise InputError, whose message begins with ``where``, for other than 4 and 3 finite numbers, or
-    a quaternion whose length is more than 0.01 from 1.
+    Raise InputError, whose message begins with ``where``, unless these are 4 and 3 finite numbers
+    and the quaternion's length is within 0.01 of 1.
     """
     from scipy.spatial.transform import Rotation
 
@@ -225,7 +229,7 @@ def quaternion_pose(
 
 
 def upright_poses(centre_m: Float, heading_rad: Float) -> Float:
-    """Return (K,4,4) poses at centres (K,3) m, turned about z by headings (K,) rad from x to y."""
+    """Return (K,4,4) poses at centres (K,3) in metres, turned from x to y by (K,) angles in rad."""
     T = np.tile(np.eye(4), (len(centre_m), 1, 1))
     T[:, 0, 0] = T[:, 1, 1] = np.cos(heading_rad)
     T[:, 1, 0] = np.sin(heading_rad)

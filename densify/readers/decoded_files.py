@@ -52,7 +52,7 @@ _RECORD_BYTES = 54  # smallest size of a variable length record of a LAS file
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """Return the array of a .npy file; raise InputError for a damaged file."""
+    """Return the array of a .npy file. Raise InputError for a damaged file."""
     data = read_bytes(path)
     try:
         return _array(data)
@@ -63,7 +63,7 @@ def read_array(path: Path) -> NDArray[Any]:
 def read_arrays(
     path: Path, names: Sequence[str] | None = None, most_bytes: int = MOST_BYTES
 ) -> Arrays:
-    """Return arrays of a .npz by name, all for None; raise InputError if over ``most_bytes``."""
+    """Return arrays of a .npz by name, all for None. Raise InputError if over ``most_bytes``."""
     data = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -79,7 +79,7 @@ def read_arrays(
 
 
 def _array(data: bytes) -> NDArray[Any]:
-    """Return the array of .npy data; raise ValueError if the header claims more than follows."""
+    """Return the array of .npy data. Raise ValueError if the header claims more than follows."""
     file, header = io.BytesIO(data), np.lib.format
     version = header.read_magic(file)
     read = header.read_array_header_1_0 if version == (1, 0) else header.read_array_header_2_0
@@ -96,7 +96,7 @@ def _array(data: bytes) -> NDArray[Any]:
 
 
 def read_image(path: Path, as_stored: bool = False) -> NDArray[Any]:
-    """Return the pixels of a PNG or JPEG file, as `decode_image` does with its bytes."""
+    """Return a PNG or JPEG file's pixels: (H,W,3) uint8 blue, green, red, unless ``as_stored``."""
     return decode_image(read_bytes(path), path, as_stored)
 
 
@@ -136,13 +136,13 @@ def decode_image(data: bytes, where: Path | str, as_stored: bool = False) -> NDA
 
 
 def image_size_px(path: Path) -> tuple[int, int]:
-    """Return the width and height (px) of an image file; raise InputError if it is damaged."""
+    """Return the width and height (px) of an image file. Raise InputError if it is damaged."""
     height, width = read_image(path).shape[:2]
     return width, height
 
 
 def stated_size_px(path: Path) -> tuple[int, int] | None:
-    """Return the width and height (px) that an image's header states; None if unreadable."""
+    """Return the width and height (px) that an image's header states, or None if unreadable."""
     from PIL import Image
 
     try:
@@ -163,7 +163,7 @@ def check_pixels(size_px: tuple[int, int], where: Path | str) -> None:
 
 
 def decode_jpeg(data: bytes) -> tuple[NDArray[np.uint8], str]:
-    """Return a JPEG's (H,W,3) BGR pixels and repairs, "" for none; ValueError if damaged."""
+    """Return a JPEG's (H,W,3) BGR pixels and repairs ("" for none). Raise ValueError if damaged."""
     pixels, complaint = _decoded_strictly(data)
     repairs = []
     if complaint.startswith(_NO_END):
@@ -191,10 +191,9 @@ def _decoded_strictly(data: bytes) -> tuple[NDArray[np.uint8] | None, str]:
 
 
 def _without_stray_bytes(data: bytes) -> tuple[bytes, int]:
-    """Return mended data, and the number of markers after stray bytes; ValueError if damaged."""
+    """Return mended data and the number of mended markers. Raise ValueError if damaged."""
     num_mended = 0
-    end = data.rfind(_SCAN)
-    # Marker by marker; ``end`` is the end of the marker before.
+    end = data.rfind(_SCAN)  # end of the marker before
     for _ in range(_MOST_MARKERS):
         marker = _RESTART_OR_END.search(data, end)
         if marker is None or data[end - 2 : end] == _END:
@@ -219,13 +218,13 @@ def _without_stray_bytes(data: bytes) -> tuple[bytes, int]:
 
 def _ends_in_ones(data: bytes, end: int) -> bool:
     """Return True if the bits that fill up the last byte before a marker are ones, as must be."""
-    # In an interval that is decoded wrongly these bits may be anything.
+    # Correct data end in ones. Where the decoder lost its place, the bits are arbitrary.
     last = data[end - 1]
     if data[end - 2 : end] == b"\xff\x00" or last == 0xFF:
         return True
     filled = last | (last + 1)  # the lowest zero becomes one
     changed = data[: end - 1] + bytes([filled]) + b"\x00" * (filled == 0xFF) + data[end:]
-    # The lowest zero must be data, not filling.
+    # If the lowest zero is data, setting it to one changes the picture. Filling would not.
     pixels, complaint = _decoded_strictly(data)
     changed_pixels, changed_complaint = _decoded_strictly(changed)
     return complaint != changed_complaint or not np.array_equal(pixels, changed_pixels)  # type: ignore
@@ -235,7 +234,7 @@ def _ends_in_ones(data: bytes, end: int) -> bool:
 
 
 def read_las(path: Path) -> Any:
-    """Return all points of a LAS or LAZ file as `laspy.LasData`; raise InputError if damaged."""
+    """Return all points of a LAS or LAZ file as `laspy.LasData`. Raise InputError if damaged."""
     import laspy
 
     data = read_bytes(path)
@@ -333,12 +332,12 @@ def read_arrow(
 
 
 def _arrow_array(column: Any, kind: str, where: str) -> NDArray[Any]:
-    """Return a column of Arrow as an array; raise InputError if it is not of the kind."""
+    """Return a column of Arrow as an array. Raise InputError if it is not of the kind."""
     expected, types = _KINDS[kind]
     type_name = str(column.type)
     num_null = column.null_count
     num_not_finite = 0
-    if kind == "l":
+    if kind == "l":  # each row has a list of its own length
         if "list" in type_name and any(name in type_name for name in types):
             lists = np.empty(len(column), object)
             for row, scalar in enumerate(column):
@@ -389,10 +388,10 @@ class _Unpickler(pickle._Unpickler):
 
 
 def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the columns (N,) of a gzipped, pickled pandas data frame, by name; no code is run.
+    """Return the columns (N,) of a gzipped, pickled pandas data frame, by name.
 
-    A column of texts holds Python objects, whose type the caller must check. Raise InputError if
-    the file is no such data frame.
+    No code of the file is run. A column of texts holds Python objects, whose type the caller must
+    check. Raise InputError if the file is no such data frame.
     """
     data = read_bytes(path)
     try:
@@ -405,7 +404,7 @@ def read_pickled(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _pickled_columns(frame: Any) -> dict[str, NDArray[Any]]:
-    """Return the columns of a frame; pandas stores the C columns of a type together, (C,N)."""
+    """Return the columns of a frame, of which pandas stores those of one type as (C,N)."""
     if type(frame).__name__ != "DataFrame":
         raise ValueError(f"it holds a {type(frame).__name__}")
     manager_state = frame.state["_data"].state[-1]["0.14.1"]
@@ -423,7 +422,7 @@ def _pickled_columns(frame: Any) -> dict[str, NDArray[Any]]:
 
 def _pickled_array(record: _Record) -> NDArray[Any]:
     """Rebuild a NumPy array from the stored state of its pickle."""
-    _, shape, dtype, by_columns, data = record.state
+    _, shape, dtype, by_columns, data = record.state  # as ndarray.__setstate__ takes them
     kind, order = dtype.args[0], dtype.state[1]
     if kind == "O8" and isinstance(data, list):
         array: NDArray[Any] = np.empty(len(data), object)

@@ -86,12 +86,14 @@ def pair_depth_files(
 ) -> DepthPairs:
     """Pair estimated PNG depth maps with true depth maps and with masks of moving objects.
 
-    Two files are paired whatever their names. In folders the frames must agree; the drive and the
-    camera too if all paths name them.
+    Two files are paired whatever their names. In folders the frames must agree, and the drive and
+    the camera too if all paths name them. Raise InputError if files are missing or ambiguous, or
+    none match.
 
     Args:
         predicted: File of an estimated map, or folder that is searched with its subfolders. Files
             of a known layout exclude others.
+        truth: File or folder of true maps.
         mask: File or folder of masks, None for none.
         filled: True to pair densify's filled maps instead of its maps of measured pixels.
     """
@@ -125,7 +127,7 @@ def pair_depth_files(
 
 
 def _depth_files(path: Path, argument: str) -> list[_File]:
-    """Return the PNG files at a path, in order; plain names only if no file has a known layout."""
+    """Return the sorted PNG files at a path: those of known layouts, or all if none is known."""
     if path.is_file():
         return [_File.parse(path)]
     # Hidden files are unfinished results. Exported maps are copies of the maps beside them.
@@ -150,7 +152,7 @@ def _last_name(pattern: re.Pattern[str], text: str) -> str | None:
 
 
 def _of_product(files: list[_File], path: Path, filled: bool) -> list[_File]:
-    """Return densify's filled or measured maps; all files if another method made them."""
+    """Return densify's filled or measured maps, or all files if another method made them."""
     chosen = [file for file in files if file.product in (_FILLED if filled else _MEASURED)]
     if filled and not chosen:
         raise InputError(
@@ -163,7 +165,7 @@ def _of_product(files: list[_File], path: Path, filled: bool) -> list[_File]:
 def _match(
     left: Sequence[_File], right: Sequence[_File], left_path: Path, right_path: Path
 ) -> dict[Path, Path]:
-    """Return right -> left path where frames agree, and drive and camera too if all name them."""
+    """Return right -> left path where the frames agree, and drive and camera if all have them."""
     names = ["frame"]
     for name in ("drive", "camera"):
         if all(getattr(file, name) is not None for file in (*left, *right)):
@@ -174,7 +176,7 @@ def _match(
 
 
 def _keyed(files: Sequence[_File], names: Sequence[str], path: Path) -> dict[str, Path]:
-    """Return paths by the text of the named fields; raise InputError if two files have the same."""
+    """Return the paths by the named fields as text. Raise InputError if two files agree in all."""
     keyed: dict[str, Path] = {}
     for file in files:
         key = " ".join(f"{name} {getattr(file, name)}" for name in names)

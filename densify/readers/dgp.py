@@ -32,7 +32,7 @@ _BOGUS_YEAR = 2200  # DDAD stores tenths of microseconds as microseconds
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
-    """Return the scene in a folder; or the scene of this name in a folder of scenes."""
+    """Return the scene in a folder, or the scene of this name in a folder of scenes."""
     if scene is None and _scene_files(path):
         return Dgp(path)
     names = sorted(folder.name for folder in path.glob("*/") if _scene_files(folder))
@@ -99,7 +99,7 @@ class Dgp(FileSequence):
         )
 
     def T_world_cam(self, camera: str, number: int) -> Float:
-        """Return the data set's (4,4) pose of a camera in the world at the time of an image."""
+        """Return the recorded (4,4) pose of a camera in the world at the exposure of an image."""
         self.check_image(camera, number)
         return self._images[camera][number].T_world_sensor
 
@@ -119,7 +119,7 @@ _Numbered = dict[str, dict[int, _Datum]]
 
 
 def _read_scene(file: Path) -> tuple[_Numbered, _Numbered, Path]:
-    """Return sweeps and images, by sensor and number, and the path of the calibration file."""
+    """Return sweeps and images, each by sensor and number, and the path of the calibration file."""
     content = read_json(file)
     sweeps: _Numbered = defaultdict(dict)
     images: _Numbered = defaultdict(dict)
@@ -155,13 +155,14 @@ def _datum(file: Path, kind: str, entry: Mapping[str, Any]) -> _Datum:
 
 
 def _stamp_ns(text: str) -> int:
-    """Return the nanoseconds since 1970 of an ISO date; ValueError if the text is no date."""
+    """Return the nanoseconds since 1970 of an ISO date. Raise ValueError if the text is no date."""
     date = datetime.fromisoformat(text.replace("Z", "+00:00"))
     microseconds = (date - datetime(1970, 1, 1, tzinfo=timezone.utc)) // timedelta(microseconds=1)
     return microseconds * (100 if date.year >= _BOGUS_YEAR else 1000)
 
 
 def _read_pose(pose: Mapping[str, Any], where: str) -> Float:
+    """Return the (4,4) pose of an entry. Messages begin with ``where``."""
     rotation, translation = pose["rotation"], pose["translation"]
     quaternion = [rotation[key] for key in ("qw", "qx", "qy", "qz")]
     return checks.quaternion_pose(quaternion, [translation[key] for key in "xyz"], where)

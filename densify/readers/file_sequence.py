@@ -38,24 +38,24 @@ class Returns:
 
 
 class FileSequence(ABC):
-    """A `LidarSequence` of files; a reader sets ``_stamps_ns`` by frame or overrides `stamp_ns`."""
+    """A `LidarSequence` of files. A reader sets ``_stamps_ns`` or overrides `stamp_ns`."""
 
     _stamps_ns: Mapping[int, int] | Sequence[int] | Int
 
     def __init__(
         self,
-        name: str,  # for people and outputs
+        name: str,  # name of the recording, for people and outputs
         where: Path,  # path of the recording, for messages
         frames: Sequence[int],  # numbers of the existing sweeps, ascending
-        cameras: Mapping[str, Camera] | None = None,  # by name
-        # Exposure time of each existing image, by camera and image number
+        cameras: Mapping[str, Camera] | None = None,  # cameras by name, None for none
+        # Exposure time of each existing image in ns, by camera and image number
         exposed_ns: Mapping[str, Mapping[int, int]] | None = None,
-        truth: Truth | None = None,  # of a simulated recording
-        files: Mapping[int, Path] | None = None,  # by frame; None if sweeps share files
-        # PNG or JPEG files by camera and number; a reader without them overrides `_image`
+        truth: Truth | None = None,  # ground truth of a simulated recording
+        files: Mapping[int, Path] | None = None,  # file of each sweep, None if sweeps share files
+        # PNG or JPEG file of each image, by camera and number. None if the reader has an `_image`
         images: Mapping[str, Mapping[int, Path]] | None = None,
     ) -> None:
-        """Store what the reader found; raise InputError if all files of sweeps are empty."""
+        """Store what the reader found. Raise InputError if all files of sweeps are empty."""
         self.name = name
         self.where = where
         self.frames: Sequence[int] = frames
@@ -80,7 +80,7 @@ class FileSequence(ABC):
 
     @abstractmethod
     def _returns(self, frame: int) -> Returns:
-        """Read all rows of an existing sweep; an exception is reported as a malformed file."""
+        """Read all rows of an existing sweep. Any exception is reported as a malformed file."""
 
     def _checked_returns(self, frame: int) -> tuple[Path, Returns]:
         """Return the path of a sweep's file, for messages, and all rows of the file."""
@@ -90,7 +90,7 @@ class FileSequence(ABC):
             return path, self._returns(frame)
 
     def sweep_bytes(self) -> dict[int, int]:
-        """Return the size (bytes) of each sweep's file, by frame; empty if sweeps share files."""
+        """Return the size of each sweep's file in bytes, by frame, empty if sweeps share files."""
         return {frame: path.stat().st_size for frame, path in self._files.items()}
 
     def check_first_images(self) -> None:
@@ -107,7 +107,7 @@ class FileSequence(ABC):
         return checks.decode_rgb(read_bytes(path), camera, path)
 
     def _pose(self, frame: int) -> Float:
-        """Return the (4,4) T_world_lidar of an existing sweep; raise InputError without poses."""
+        """Return the (4,4) T_world_lidar of an existing sweep. Raise InputError without poses."""
         raise InputError(
             f"{self.where}: no poses; let the sweeps register themselves with "
             f"--set register.source=kiss-icp"
@@ -122,7 +122,8 @@ class FileSequence(ABC):
         path, returns = self._checked_returns(frame)
         x, y, z = returns.points.T  # by columns: reductions over rows of three are far slower
         is_finite = np.isfinite(x) & np.isfinite(y) & np.isfinite(z)
-        row = np.flatnonzero(is_finite & ((x != 0) | (y != 0) | (z != 0)))
+        is_padding = (x == 0) & (y == 0) & (z == 0)
+        row = np.flatnonzero(is_finite & ~is_padding)
         if not len(row):
             untimed = f", {returns.num_untimed} with a time of another sweep"
             raise InputError(
@@ -163,11 +164,11 @@ class FileSequence(ABC):
         return self._exposed_ns.get(camera, {})
 
     def image(self, camera: str, number: int) -> NDArray[np.uint8]:
-        """Return an image as (H,W,3) uint8 RGB; InputError if it is missing or of another size."""
+        """Return an image as (H,W,3) uint8 RGB. Raise InputError if missing or of another size."""
         return self._image(self.check_image(camera, number), number)
 
     def T_world_lidar(self, frame: int) -> Float:
-        """Return the recorded (4,4) lidar pose at a sweep's stamp; InputError without poses."""
+        """Return the recorded (4,4) lidar pose at a sweep's stamp, or raise InputError."""
         self.check_frame(frame)
         return checks.pose(self._pose(frame), f"{self.where}: pose of frame {frame}")
 
@@ -176,7 +177,7 @@ class FileSequence(ABC):
         checks.find_entry(self._frames, frame, "sweep", self.where)
 
     def check_image(self, camera: str, number: int) -> Camera:
-        """Return the camera of an image; raise InputError if the image does not exist."""
+        """Return the camera of an image. Raise InputError if the image does not exist."""
         calibrated = checks.camera_named(self.cameras, camera, self.where)
         checks.find_entry(self._exposed_ns.get(camera, {}), number, f"{camera} image", self.where)
         return calibrated

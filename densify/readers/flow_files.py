@@ -47,7 +47,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def estimate_motion(scene: Scene, settings: Config, argument: str) -> Motion:
-    """Return the motion by a folder's flow files (engine ``npz:FOLDER``); InputError without it."""
+    """Return the motion by the flow files of the folder ``argument`` (engine ``npz:FOLDER``)."""
     check_argument(argument)
     step = partial(read_step, Path(argument), scene.stretch)
     return ChainedMotion(scene.stretch, step)
@@ -60,7 +60,7 @@ def check_argument(argument: str) -> None:
 
 
 def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowField:
-    """Return the flow of a sweep to another, ego-motion removed, lidar frame.
+    """Return the flow of a sweep to another sweep, without ego-motion, in the source's lidar frame.
 
     ``source`` and ``target`` are indices in ``stretch``. A point that the file lacks is static.
     Raise InputError if the file is missing or malformed.
@@ -70,12 +70,12 @@ def read_step(folder: Path, stretch: Stretch, source: int, target: int) -> FlowF
     moving = columns["moving"].astype(bool)
     residual[~moving] = 0.0
     instance = columns["object"].astype(np.int32)
-    no_lost = np.zeros(len(moving), bool)
-    return FlowField(residual, moving, instance, no_lost, columns.get("to_reference"))
+    lost = np.zeros(len(moving), bool)  # flow files do not state which points are lost
+    return FlowField(residual, moving, instance, lost, columns.get("to_reference"))
 
 
 def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Columns:
-    """Return a flow file's arrays for a sweep's N points; missing ones have flow 0, object -1."""
+    """Return a flow file's arrays for a sweep's N points, flow 0 and object -1 for missing ones."""
     path = folder / f"{frame:06d}_{target:06d}.npz"
     sweep = stretch[frame].sweep
     row = sweep.row
@@ -99,7 +99,7 @@ def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Co
         columns[name] = np.zeros((len(row), *array.shape[1:]))
         columns[name][has_entry] = array[entry[has_entry]]
 
-    # Missing columns
+    # Missing columns. residual = T_source_target (p + total) - p - to_reference
     if "residual_flow" not in arrays:
         T_source_target = stretch.T_target_source(frame, target)
         arrived = poses.transform(T_source_target, sweep.points + columns["total_flow"])
@@ -113,7 +113,7 @@ def _step_columns(folder: Path, stretch: Stretch, frame: int, target: int) -> Co
 
 
 def load_flow_file(path: Path) -> Columns:
-    """Return the arrays of a flow file by name, as stored; InputError if missing or malformed."""
+    """Return the stored arrays of a flow file. Raise InputError if missing or malformed."""
     if not path.is_file():
         raise InputError(f"{path}: no such flow file; expected one for every step to the key")
     arrays = read_arrays(path, _KNOWN)
@@ -177,7 +177,7 @@ class LabelledFlow:
 
 
 def read_labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) -> LabelledFlow:
-    """Return a sweep's ground-truth flow to the next sweep; raise InputError if it is missing.
+    """Return a sweep's ground-truth flow to the next sweep. Raise InputError if it is missing.
 
     Args:
         folder: Folder of flow files or of Argoverse 2 labels.
@@ -190,6 +190,7 @@ def read_labelled_flow(folder: Path, name: str, stretch: Stretch, frame: int) ->
     if any(folder.glob("*_*.npz")):
         target = stretch.frames[stretch.frames.index(frame) + 1]
         columns = _step_columns(folder, stretch, frame, target)
+        # Flow files know objects, but not their classes.
         classes = np.where(columns["object"] >= 0, _OBJECT, 0).astype(np.uint8)
         return LabelledFlow(columns["residual_flow"], classes, columns["valid"])
     label_folder = folder / name if (folder / name).is_dir() else folder

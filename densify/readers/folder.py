@@ -38,18 +38,19 @@ from densify.readers.timeline import median_period_ns
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _SEARCH_DEPTH = 2  # levels of subfolders
 _ASSUMED_HZ = 10.0
+_NAMED = ("intensity", "time", "lidar")  # quantities whose column densify.yaml may name
 _UNTIMED = (
     "times of points are left out: they are compensated, and no poses with stamps tell by how much"
 )
 
 
 def open_recording(path: Path, scene: str | None) -> Folder:
-    """Return a folder of sweeps; ``scene`` is not used."""
+    """Return the recording in a folder of sweeps, which has no scenes."""
     return Folder(path)
 
 
 class Folder(FileSequence):
-    """A folder of sweeps as a `LidarSequence`; `findings` states what the reader detected."""
+    """A folder of sweeps as a `LidarSequence`. `findings` states what the reader detected."""
 
     def __init__(self, path: Path | str) -> None:
         folder = Path(path)
@@ -82,7 +83,7 @@ class Folder(FileSequence):
         self._is_untimed = self._settings.compensated and self._track is None
 
     def _pairing(self, images: Mapping[int, Path]) -> str:
-        """Describe that images have the stamps of sweeps, though nobody asked for it."""
+        """Describe that images have the stamps of sweeps, which is an assumption of the reader."""
         text = (
             f"{len(images)} images without stamps beside {len(self.frames)} sweeps: each is taken "
             f"as exposed when the sweep of its number is stamped"
@@ -167,7 +168,7 @@ class Folder(FileSequence):
         return f"number, at {article} {1e9 / self._period_ns:g} Hz (rate_hz)"
 
     def stamp_ns(self, frame: int) -> int:
-        """Return a sweep's stamp (ns), else an absolute time of its points, else frame x period."""
+        """Return a sweep's stamp in ns, else a time of its points, else frame times period."""
         self.check_frame(frame)
         if self._sweep_stamps_ns is not None:
             return self._sweep_stamps_ns[frame]
@@ -194,7 +195,7 @@ class Folder(FileSequence):
 
     @cached_property
     def _period_ns(self) -> int:
-        """The median time between stamps in ns; without stamps, the period of the assumed rate."""
+        """The median time between stamps in ns, or the assumed period without stamps."""
         assumed_ns = round(1e9 / (self._settings.rate_hz or _ASSUMED_HZ))
         return median_period_ns([*(self._sweep_stamps_ns or {}).values()], assumed_ns)
 
@@ -203,8 +204,9 @@ class Folder(FileSequence):
         """The meaning of the columns, found in a few sweeps."""
         frame, columns = next(iter(self._samples.items()))
         path, settings, stamps_ns = self._files[frame], self._settings, self._sweep_stamps_ns
-        named = {q: name for q in ("intensity", "time", "lidar") if (name := getattr(settings, q))}
-        for quantity, name in named.items():
+        column_of = {quantity: getattr(settings, quantity) for quantity in _NAMED}
+        column_of = {quantity: name for quantity, name in column_of.items() if name}
+        for quantity, name in column_of.items():
             if name not in columns:
                 raise InputError(
                     f"{self._config.path}: sweeps.{quantity}: got {name!r}, expected a column of "
@@ -215,7 +217,7 @@ class Folder(FileSequence):
             path,
             self._period_ns,
             stamps_ns=None if stamps_ns is None else [stamps_ns[f] for f in self._samples],
-            named=named,
+            named=column_of,
             intensity_scale=settings.intensity_scale,
             unit=settings.time_unit,
             absolute=settings.time_is == "absolute" if settings.time_is else None,
@@ -233,11 +235,13 @@ class Folder(FileSequence):
         return {name: column for name, column in columns.items() if column.dtype.kind in "fiu"}
 
     def _returns(self, frame: int) -> Returns:
+        """Read all rows of a sweep, and undo what the files did to its points."""
         stamp_ns, path, settings = self.stamp_ns(frame), self._files[frame], self._settings
         columns = self._columns(path)
         returns = self._layout.returns(columns, path, stamp_ns)
         lidar = None
         if name := self._layout.fields.get("lidar"):
+            # Invalid rows may hold any number.
             numbers = np.where(returns.points.any(axis=1), columns[name], 0)
             if not np.isin(numbers, np.arange(256)).all():
                 raise InputError(f"{path}: {name}: expected the number of a scanner, 0 to 255")
@@ -253,7 +257,7 @@ class Folder(FileSequence):
             return replace(returns, points=points, offset_ns=None)  # compensated to the pose
         if not settings.compensated or returns.offset_ns is None:
             return returns
-        if self._track is None:  # _is_untimed
+        if self._track is None:  # the compensation cannot be undone, so the times do not apply
             return replace(returns, offset_ns=None)
         points = self._track.undo_compensation(points, stamp_ns, returns.offset_ns)
         return replace(returns, points=points)
@@ -297,7 +301,7 @@ def _is_numbered(path: Path) -> bool:
 
 
 def _find_images(folder: Path, name: str, config: CameraFiles) -> Series:
-    """Return the images of a camera in the order of time; raise InputError without any."""
+    """Return the images of a camera in the order of time. Raise InputError without any."""
     below = files_below(folder / config.files, _IMAGE_SUFFIXES, 0)
     if not below:
         key = f"cameras: {{{name}: {{files: {config.files}}}}}"

@@ -26,7 +26,7 @@ C = TypeVar("C")
 
 
 class Kind(NamedTuple):
-    """A kind of values in the YAML."""
+    """The type of a YAML value: how it is checked and converted, and how messages describe it."""
 
     convert: Callable[[Any], Any]  # returns the converted value; raises ValueError for a wrong one
     expected: str  # description, for messages
@@ -37,26 +37,26 @@ class Kind(NamedTuple):
 
 
 def _require(is_right: Any, value: Any) -> Any:
-    """Return the value; raise ValueError if it is not right."""
+    """Return the value, or raise ValueError if ``is_right`` is false."""
     if not is_right:
         raise ValueError
     return value
 
 
 def _array(value: Any, *shape: int) -> Float:
-    """Return finite numbers of a shape."""
+    """Return finite numbers as an array of this shape. Raise ValueError for other values."""
     array = np.array(value, dtype=np.float64).reshape(shape)
     return _require(np.isfinite(array).all(), array)
 
 
 def _above_0(value: Any) -> float:
-    """Return a number above 0."""
+    """Return a number above 0. Raise ValueError for other values."""
     number = float(_array(value))  # text too: YAML 1.1 reads 1e-3 as text
     return _require(number > 0, number)
 
 
 def _names(value: Any) -> tuple[str, ...]:
-    """Return a list of one or more names."""
+    """Return a list of one or more names as a tuple. Raise ValueError for other values."""
     is_list = isinstance(value, list) and value and all(isinstance(name, str) for name in value)
     return tuple(_require(is_list, value))
 
@@ -86,7 +86,7 @@ def _size_px(value: Any) -> tuple[int, int]:
 
 
 def _one_of(choices: Collection[str]) -> Kind:
-    """Return the kind of values that are one of these names."""
+    """Return the kind of values that are one of the names ``choices``."""
     return Kind({name: name for name in choices}.__getitem__, f"one of {', '.join(choices)}")
 
 
@@ -104,22 +104,26 @@ _POINTS = Kind(lambda value: _array(value, -1, 3), "finite numbers of shape (N, 
 
 @dataclass(frozen=True)
 class SweepFiles:
-    """Section ``sweeps``. By default ("", 0 or None) the reader finds the value in the files."""
+    """Section ``sweeps``: files and columns of the sweeps.
+
+    Where a comment does not state its meaning, "" lets the reader detect the value.
+    """
 
     files: str = _TEXT.key("")  # path of the folder of the sweeps
     # Names of the columns, for files that do not name them
     columns: tuple[str, ...] | None = Kind(_names, "a list of names").key(None)
     scale_m: float = _ABOVE_0.key(1.0)  # length of one unit of the stored points, in metres
     # (3,3) matrix that turns (or mirrors) stored points into the lidar frame, x forward, y left, z
-    # up; None for the identity
+    # up. None is the identity.
     axes: Float | None = Kind(_axes, "x, y and z in some order, such as [z, -x, -y]").key(None)
     intensity: str = _TEXT.key("")  # name of the column with intensities
-    intensity_scale: float = _ABOVE_0.key(0.0)  # stored intensity that becomes 1
+    intensity_scale: float = _ABOVE_0.key(0.0)  # stored intensity that becomes 1, 0 to detect
     time: str = _TEXT.key("")  # name of the column with the firing times of the points
     time_unit: str = _UNIT.key("")  # unit of the firing times
     # "relative" for times since the stamp, "absolute" for times since an epoch
     time_is: str = _one_of(("relative", "absolute")).key("")
-    reference: str = _one_of(REFERENCES).key("")  # moment of the sweep that its stamp marks
+    # Moment of the sweep that its stamp marks, "" to take the firing times as they are
+    reference: str = _one_of(REFERENCES).key("")
     lidar: str = _TEXT.key("")  # name of the column with the index of the scanner
     # ``names`` if file names are stamps, or the path of a file with a stamp per sweep
     stamps: str = _TEXT.key("")
@@ -134,7 +138,7 @@ class SweepFiles:
 
 @dataclass(frozen=True)
 class Poses:
-    """Section ``poses``."""
+    """Section ``poses``: the file of poses, and what the poses mean."""
 
     file: str = _TEXT.key("")  # path of the pose file, "" to search for it
     stamps_unit: str = _UNIT.key("")  # unit of the stamps of the poses, "" to detect it
@@ -145,7 +149,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class CameraFiles:
-    """One camera of the section ``cameras``; `Camera` describes the keys without a comment."""
+    """One camera of the section ``cameras``. `Camera` describes the keys without a comment."""
 
     size: tuple[int, int] = Kind(_size_px, "[width, height] in whole pixels").key()
     K: Float = Kind(_intrinsics, "[fx, fy, cx, cy] or three rows, with fx and fy above 0").key()
@@ -183,7 +187,7 @@ class FolderConfig:
 
     @staticmethod
     def read(folder: Path) -> FolderConfig:
-        """Return a folder's densify.yaml, the defaults without one; InputError if malformed."""
+        """Return a folder's densify.yaml, or the defaults. Raise InputError if malformed."""
         path = folder / NAME
         if not path.is_file():
             return FolderConfig()
@@ -229,15 +233,15 @@ class _File(NamedTuple):
         known = {f.name: f for f in fields(section)}  # type: ignore[arg-type]
         settings = self.mapping(key, value, known)
         arguments = {}
-        for name, knob in known.items():
-            (convert, expected), got = knob.metadata["kind"], settings.get(name)
+        for name, key_field in known.items():
+            kind, value_got = key_field.metadata["kind"], settings.get(name)
             try:
-                if got is not None:
-                    arguments[name] = convert(got)
+                if value_got is not None:
+                    arguments[name] = kind.convert(value_got)
             except (ValueError, TypeError, KeyError, OverflowError, InputError):
-                raise self.unfit(f"{key}.{name}", got, expected) from None
-            if got is None and knob.default is MISSING:
-                raise self.unfit(f"{key}.{name}", None, expected)
+                raise self.unfit(f"{key}.{name}", value_got, kind.expected) from None
+            if value_got is None and key_field.default is MISSING:
+                raise self.unfit(f"{key}.{name}", None, kind.expected)
         return section(**arguments)
 
     def camera(self, name: str, value: Any) -> CameraFiles:
@@ -247,6 +251,7 @@ class _File(NamedTuple):
             raise self.unfit(key, value, "a name of letters, digits, _ - .")
         settings = self.filled(CameraFiles, key, value)
         counts = _NUM_COEFFICIENTS[settings.model]
+        # A camera drops coefficients that are all 0, so their number does not matter.
         if len(settings.camera(name).distortion) not in counts:
             expected = f"{', '.join(map(str, counts))} coefficients for a {settings.model} camera"
             raise self.unfit(f"{key}.distortion", settings.distortion, expected)

@@ -73,7 +73,7 @@ _FISHEYES_360 = ("image_02", "image_03")
 
 
 def open_recording(path: Path, scene: str | None) -> Drive:
-    """Return the drive or sequence at a path; ``scene`` names one of several in a folder."""
+    """Return the drive or sequence at a path, or ``scene``, one of several in a folder."""
     if (path / "velodyne_points").is_dir():
         return KittiRaw(path)
     if (path / "data_3d_raw").is_dir():
@@ -90,7 +90,7 @@ def open_recording(path: Path, scene: str | None) -> Drive:
 
 
 def _scene(reader: str, path: Path, scene: str | None, names: list[str]) -> str:
-    """Return the name of the requested or the only scene; raise InputError if not clear."""
+    """Return the name of the requested or the only scene. Raise InputError if not clear."""
     none = (
         "no KITTI recording; expected velodyne_points/ (a raw drive), data_3d_raw/ (KITTI-360), "
         "velodyne/0000/ (tracking), or sequences/ or velodyne/ (odometry)"
@@ -99,12 +99,12 @@ def _scene(reader: str, path: Path, scene: str | None, names: list[str]) -> str:
 
 
 class Drive(FileSequence):
-    """Numbered sweeps of an HDL-64E, which turns clockwise and is stamped when it faces forward."""
+    """Numbered sweeps of an HDL-64E that turns clockwise and faces forward at the stamp."""
 
     def __init__(
         self, name: str, where: Path, sweeps: Path, stamps: Stamps, images: Mapping[str, Path]
     ) -> None:
-        """Find .bin files in the folder ``sweeps``, and images in ``images`` (camera -> folder)."""
+        """Find the .bin files in the folder ``sweeps``, and images in the folder of each camera."""
         files = checks.numbered_files(sweeps, ".bin")
         if not files:
             raise InputError(f"{sweeps}: no sweeps; expected files such as 0000000120.bin")
@@ -118,7 +118,7 @@ class Drive(FileSequence):
         self._exposed_ns = {camera: stamps.of(numbers) for camera, numbers in numbered.items()}
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep (ns); raise InputError if the frame has no stamp."""
+        """Return the reference time of a sweep in ns. Raise InputError if it has no stamp."""
         self.check_frame(frame)
         return self._stamps.at(frame)
 
@@ -219,8 +219,8 @@ class KittiRaw(Drive):
 
     def _T_world_imu(self, frame: int) -> Float:
         paths = self._oxts[min(self._oxts)], self._oxts[frame]
-        first, record = (parse_oxts(read_text(path), str(path)) for path in paths)
-        return T_first_imu(first, record)
+        first_record, record = (parse_oxts(read_text(path), str(path)) for path in paths)
+        return T_first_imu(first_record, record)
 
     @cached_property
     def _oxts_stamps(self) -> Stamps:
@@ -243,7 +243,7 @@ def _image_folders(drive: Path) -> list[str]:
 
 
 def _raw_cameras(drive: Path) -> dict[str, Camera]:
-    """Return the calibrated cameras with images by name; all if there are no folders of images."""
+    """Return the calibrated cameras by name: those with images, or all if no images exist."""
     folder, names = _calibration_folder(drive), _image_folders(drive)
     files = [folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"]
     if not names and not all(file.is_file() for file in files):
@@ -285,7 +285,7 @@ class KittiOdometry(Drive):
         if self._track is None:
             return Returns(stored, intensity)
         points = stored
-        for _ in range(_NUM_ROUNDS):
+        for _ in range(_NUM_ROUNDS):  # times from azimuths, then azimuths from times
             offset_ns = turned_ns(points, self._stamps.period_ns)
             points = self._track.undo_compensation(stored, self.stamp_ns(frame), offset_ns)
         return Returns(points, intensity, offset_ns)
@@ -307,11 +307,11 @@ class KittiOdometry(Drive):
         if path is None:
             return None
         T_first_cam, T_cam_lidar = PoseFile.read(path).T, self._calibration.motion("Tr")
-        num = len(T_first_cam)
+        num_poses = len(T_first_cam)
         if self._stamps.by_frame:
-            num = min(num, len(self._stamps.by_frame))
-        stamps_ns = np.array([self._stamps.at(frame) for frame in range(num)], np.int64)
-        T = poses.inverse(T_cam_lidar) @ T_first_cam[:num] @ T_cam_lidar
+            num_poses = min(num_poses, len(self._stamps.by_frame))
+        stamps_ns = np.array([self._stamps.at(frame) for frame in range(num_poses)], np.int64)
+        T = poses.inverse(T_cam_lidar) @ T_first_cam[:num_poses] @ T_cam_lidar
         return PoseTrack(str(path), stamps_ns, T)
 
 
@@ -339,14 +339,15 @@ class KittiTracking(Drive):
         if not path.exists():
             return super()._pose(frame)
         lines = dict(enumerate(read_text(path).splitlines()))
-        first, record = (
+        first_record, record = (
             parse_oxts(checks.find_entry(lines, f, "oxts record", path), f"{path}: line {f + 1}")
             for f in (0, frame)
         )
-        return T_first_imu(first, record) @ poses.inverse(self._calibration.motion("Tr_imu_velo"))
+        T_lidar_imu = self._calibration.motion("Tr_imu_velo")
+        return T_first_imu(first_record, record) @ poses.inverse(T_lidar_imu)
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes at their firing times, in the lidar frame; None without labels."""
+        """Return a sweep's boxes at their firing times, lidar frame, or None without labels."""
         self.check_frame(frame)
         path = self.where / "label_02" / self._scene_file
         if not path.is_file():
@@ -356,18 +357,19 @@ class KittiTracking(Drive):
         is_of_frame = numbers[:, 0] == frame
         labels = numbers[is_of_frame & ~is_area]
         areas_px = numbers[is_of_frame & is_area, 5:9]
-        height_m, width_m, length_m, right, down, forward, turn = labels[:, 9:16].T
-        centre_m = np.column_stack([right, forward, height_m / 2 - down])
-        T_cam_box = _T_CAM_UPRIGHT @ checks.upright_poses(centre_m, -turn)
+        height_m, width_m, length_m, right_m, down_m, forward_m, turn_rad = labels[:, 9:16].T
+        # Labels have the middle of the bottom, boxes their own middle.
+        centre_m = np.column_stack([right_m, forward_m, height_m / 2 - down_m])
+        T_cam_box = _T_CAM_UPRIGHT @ checks.upright_poses(centre_m, -turn_rad)
         T_lidar_box = poses.inverse(self._T_rect_lidar) @ T_cam_box
         size_m = np.column_stack([length_m, width_m, height_m])
         tracks = [f"{track:.0f}" for track in labels[:, 1]]
-        checked = checks.boxes(tracks, T_lidar_box, size_m, f"{path}: frame {frame}")
+        frame_boxes = checks.boxes(tracks, T_lidar_box, size_m, f"{path}: frame {frame}")
         camera = self.cameras.get("image_02") or self._calibration.rectified_camera(
             "P2", "image_02", _SMALLEST_IMAGE_PX, self._T_rect_lidar
         )
         offset_ns = turned_ns(T_lidar_box[:, :3, 3], NOMINAL_PERIOD_NS)
-        return replace(checked, offset_ns=offset_ns, view=BoxView(camera, areas_px))
+        return replace(frame_boxes, offset_ns=offset_ns, view=BoxView(camera, areas_px))
 
     @cached_property
     def _calibration(self) -> Calibration:

@@ -28,7 +28,7 @@ _HALF_VIEW_DEG = 90.0  # of a fisheye
 
 
 def read_points(path: Path) -> tuple[Float, np.ndarray]:
-    """Return a sweep file's (N,3) points (m, lidar frame) and (N,) reflectances (0 to 1).
+    """Return the (N,3) points of a sweep in metres, lidar frame, and (N,) reflectances, 0 to 1.
 
     A point that is not finite becomes 0 0 0. Raise InputError if the file is cut off.
     """
@@ -44,10 +44,10 @@ def read_points(path: Path) -> tuple[Float, np.ndarray]:
 
 
 def turned_ns(points: Float, revolution_ns: int) -> Int:
-    """Return (N,) int64 ns from facing forward to the firing at each point, clockwise.
+    """Return the (N,) int64 times in ns from facing forward to the firing at each point.
 
-    The times are from minus half to plus half of ``revolution_ns``, the duration of a revolution.
-    ``points`` (N,3) are in the lidar frame and not deskewed.
+    The scanner turns clockwise. The times are from minus half to plus half of ``revolution_ns``,
+    the duration of a revolution. ``points`` (N,3) are in the lidar frame and not deskewed.
     """
     # -0.5 to 0.5: firing times of the first half are negative
     revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
@@ -62,19 +62,19 @@ class Stamps:
     by_frame: Mapping[int, int]  # empty without the file: frame k is at k times 100 ms
 
     def at(self, frame: int) -> int:
-        """Return the time (ns) of a frame; raise InputError if the file has no time of it."""
+        """Return the time of a frame in ns. Raise InputError if the file lacks the frame."""
         if not self.by_frame:
             return frame * NOMINAL_PERIOD_NS
         return checks.find_entry(self.by_frame, frame, "stamp", self.path)
 
     def of(self, frames: Mapping[int, Path]) -> dict[int, int]:
-        """Return frame -> time (ns) for those of the given frames that have a time."""
+        """Return frame -> time in ns for the given frames that have a time."""
         known = self.by_frame or frames
         return {frame: self.at(frame) for frame in frames if frame in known}
 
     @property
     def period_ns(self) -> int:
-        """Median time (ns) between consecutive stamps; 100 ms for fewer than two."""
+        """Median time between consecutive stamps in ns, 100 ms for fewer than two stamps."""
         steps_ns = np.diff(list(self.by_frame.values()))
         return int(np.median(steps_ns)) if len(steps_ns) else NOMINAL_PERIOD_NS
 
@@ -82,8 +82,8 @@ class Stamps:
 def read_stamps(path: Path, required: bool = True) -> Stamps:
     """Return the stamps of a file with a date (UTC) on line k for frame k.
 
-    Other lines give no stamp; InputError if no line has one. A missing file has no stamps, or
-    raises InputError if ``required``.
+    A line without a date gives no stamp. Raise InputError if the file has lines but no date, or is
+    missing and ``required``.
     """
     if not required and not path.exists():
         return Stamps(path, {})
@@ -104,23 +104,29 @@ def read_stamps(path: Path, required: bool = True) -> Stamps:
 
 
 def parse_oxts(text: str, where: str) -> Float:
-    """Return (30,) numbers: latitude, longitude (deg), altitude (m), roll, pitch, yaw (rad), ..."""
+    """Return the 30 numbers of a GPS/IMU record as (30,).
+
+    They begin with latitude and longitude (deg), altitude (m), roll, pitch and yaw (rad).
+    """
     values = checks.parse_numbers(text, where, 30)
-    if abs(values[0]) >= 90:
-        raise InputError(f"{where}: got a latitude of {values[0]:g} deg, expected -90 to 90")
+    lat_deg = values[0]
+    if abs(lat_deg) >= 90:  # the Mercator projection has no poles
+        raise InputError(f"{where}: got a latitude of {lat_deg:g} deg, expected -90 to 90")
     return values
 
 
 def T_first_imu(first: Float, record: Float) -> Float:
-    """Return the (4,4) GPS/IMU pose at the oxts numbers ``record`` in its frame at ``first``."""
+    """Return the (4,4) GPS/IMU pose at ``record`` in the unit's frame at ``first``, both (30,)."""
     return poses.inverse(_T_mercator_imu(first, first)) @ _T_mercator_imu(record, first)
 
 
 def _T_mercator_imu(oxts: Float, first: Float) -> Float:
     """Return the (4,4) pose on the Mercator plane (x east, y north, z up)."""
     # As convertOxtsToPose of KITTI's devkit: the drive's first record determines the scale.
+    # x = scale lon, y = scale ln tan((90 deg + lat) / 2), scale = radius cos(first lat)
     lat_deg, lon_deg, alt_m, roll, pitch, yaw = oxts[:6]
-    scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first[0]))
+    first_lat_deg = first[0]
+    scale_m = _EARTH_RADIUS_M * np.cos(np.deg2rad(first_lat_deg))
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
     T[0, 3] = scale_m * np.deg2rad(lon_deg)
@@ -138,7 +144,7 @@ class Calibration:
 
     @staticmethod
     def read(path: Path) -> Calibration:
-        """Return the entries of a calibration file; raise InputError if it is missing."""
+        """Return the entries of a calibration file. Raise InputError if the file is missing."""
         if not path.is_file():
             raise InputError(
                 f"{path}: missing; expected KITTI's calibration there (it is a download of its own)"
@@ -154,11 +160,11 @@ class Calibration:
         return checks.parse_numbers(self.entries[key], where, int(np.prod(shape))).reshape(shape)
 
     def motion(self, key: str) -> Float:
-        """Return the (4,4) transform of an entry of twelve numbers, its upper three rows."""
+        """Return the (4,4) transform of an entry that has its upper three rows."""
         return checks.pose(self.numbers(key, 3, 4), f"{self.path}: {key}")
 
     def rotation(self, key: str, translation: str = "") -> Float:
-        """Return the (4,4) transform of a rotation and an entry ``translation`` (m), "" for 0."""
+        """Return the (4,4) transform of the entries of a rotation and a translation, "" for 0."""
         t = self.numbers(translation, 3, 1) if translation else np.zeros((3, 1))
         return checks.pose(np.hstack([self.numbers(key, 3, 3), t]), f"{self.path}: {key}")
 
@@ -195,13 +201,14 @@ def read_fisheye(path: Path, name: str, T_cam_lidar: Float) -> Camera:
         pinhole = [projection[key] for key in ("gamma1", "gamma2", "u0", "v0")]
         words = [content["image_width"], content["image_height"], *pinhole, *lens]
     width, height, *numbers = checks.parse_numbers(" ".join(map(str, words)), str(path), 11)
-    size_px, distortion = (int(width), int(height)), tuple(map(float, numbers[4:]))
-    camera = checks.pinhole(name, size_px, numbers[:4], T_cam_lidar, str(path))
+    fx_fy_cx_cy, distortion = numbers[:4], tuple(map(float, numbers[4:]))
+    size_px = int(width), int(height)
+    camera = checks.pinhole(name, size_px, fx_fy_cx_cy, T_cam_lidar, str(path))
     return replace(camera, distortion=distortion, model="mei", max_angle_deg=_HALF_VIEW_DEG)
 
 
 def read_labels(path: Path) -> tuple[Float, Bool]:
-    """Return (n,16) numbers of label lines without type and score, and an (n,) mask of DontCare."""
+    """Return the numbers (n,16) of label lines without type and score, and a DontCare mask (n,)."""
     rows, is_area = [], []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()

@@ -55,7 +55,7 @@ Record = dict[str, Any]
 
 
 def stamp_ns(record: Record) -> int:
-    """Return the time of a record in nanoseconds since 1970; tables have microseconds."""
+    """Return the time of a record in nanoseconds since 1970. Tables have microseconds."""
     return int(np.int64(int(record["timestamp"]) * 1000))
 
 
@@ -66,7 +66,7 @@ def _pose_of(record: Record, path: Path) -> Float:
 
 
 def read_table(path: Path) -> dict[str, Record]:
-    """Return all records of a JSON table by their tokens; InputError if missing or damaged."""
+    """Return the records of a JSON table by token. Raise InputError if missing or damaged."""
     with described_in(path, _EXPECTED):
         return {str(record["token"]): record for record in read_json(_existing(path))}
 
@@ -81,7 +81,7 @@ def find_records(path: Path, key: str, wanted: Collection[str]) -> dict[str, Rec
             open_file(_existing(path)) as file,
             mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data,
         ):
-            # The records are searched as text: tables have millions of records.
+            # The records are searched as text, because tables have millions of records.
             begin = data[:4096].removeprefix(codecs.BOM_UTF8).lstrip()
             if begin[:1] != b"[" or data[-4096:].rstrip()[-1:] != b"]":
                 raise ValueError("it does not begin with [ or end with ]")
@@ -112,7 +112,7 @@ class KeyBox(NamedTuple):
 
 @dataclass(frozen=True)
 class Annotations:
-    """The boxes of a scene's n key frames (2 Hz); between them, boxes are interpolated."""
+    """The boxes of a scene's n key frames (2 Hz). Between key frames, boxes are interpolated."""
 
     where: str  # path of the table, for messages
     key_ns: Int  # (n,) ascending times of the key frames
@@ -120,7 +120,7 @@ class Annotations:
 
     @staticmethod
     def read(tables: Path, scene: str) -> Annotations | None:
-        """Read the boxes of a scene (a token); None without a table or boxes of this scene."""
+        """Read the boxes of the scene with this token, or return None without any box of it."""
         path = tables / "sample_annotation.json"
         if not path.is_file():
             return None
@@ -141,7 +141,7 @@ class Annotations:
         return Annotations(str(path), key_ns, (*boxes.values(),)) if any(boxes.values()) else None
 
     def at(self, stamp_ns: int, T_lidar_world: Float) -> Boxes | None:
-        """Return the boxes at a time, interpolated, lidar frame; None outside the key frames."""
+        """Return the boxes at a time, interpolated, lidar frame, or None outside the key frames."""
         if not self.key_ns[0] <= stamp_ns <= self.key_ns[-1]:
             return None
         after = int(np.searchsorted(self.key_ns, stamp_ns))
@@ -157,21 +157,21 @@ class Annotations:
         )
 
     def _box(self, instance: str, before: int, after: int, stamp_ns: int) -> KeyBox:
-        """Inter- or extrapolate an object's box between key frames ``before`` and ``after``."""
+        """Return an object's box at a time, from its boxes in key frames at or near this time."""
         # At constant velocity and turn rate, as in the devkit. An object in only one of the two is
         # extrapolated from its nearest motion; it gets no track name, as its position is unknown.
-        for first in (before, after, before - 1):
-            pair = [boxes.get(instance) for boxes in self.boxes[max(first, 0) : first + 2]]
-            if first >= 0 and len(pair) == 2 and pair[0] and pair[1]:
-                span_ns = self.key_ns[first + 1] - self.key_ns[first]
-                share = float((stamp_ns - self.key_ns[first]) / span_ns)
-                T = interpolate(pair[0].T_world_box, pair[1].T_world_box, share)
-                return KeyBox(T, (pair[1] if share > 0.5 else pair[0]).size_m)
+        for row in (before, after, before - 1):
+            pair = [boxes.get(instance) for boxes in self.boxes[max(row, 0) : row + 2]]
+            if row >= 0 and len(pair) == 2 and pair[0] and pair[1]:
+                span_ns = self.key_ns[row + 1] - self.key_ns[row]
+                fraction = float((stamp_ns - self.key_ns[row]) / span_ns)
+                T = interpolate(pair[0].T_world_box, pair[1].T_world_box, fraction)
+                return KeyBox(T, (pair[1] if fraction > 0.5 else pair[0]).size_m)
         return {**self.boxes[before], **self.boxes[after]}[instance]
 
 
 def open_recording(path: Path, scene: str | None) -> NuScenes:
-    """Return a scene, such as ``scene-0061``, of the folder of the JSON tables or its parent."""
+    """Return the scene ``scene`` of the folder of the JSON tables, or of this folder's parent."""
     folders = [path] if (path / "sample_data.json").is_file() else []
     folders = folders or sorted(file.parent for file in path.glob("v*/sample_data.json"))
     if not folders:
@@ -216,7 +216,7 @@ def _read_path(tables: Path, token: str, name: str) -> tuple[list[Record], PoseT
 
 
 def _channels(tables: Path, records: Sequence[Record]) -> dict[str, dict[str, dict[int, Datum]]]:
-    """Return sweeps and images by modality, channel and number; ``records`` ascend in time."""
+    """Return sweeps and images by modality, channel and number from records in order of time."""
     path, table = tables / "calibrated_sensor.json", tables / "sample_data.json"
     calibrated, sensors = read_table(path), read_table(tables / "sensor.json")
     tokens = {record["calibrated_sensor_token"] for record in records}
@@ -237,7 +237,7 @@ def _channels(tables: Path, records: Sequence[Record]) -> dict[str, dict[str, di
 
 
 class NuScenes(FileSequence):
-    """A nuScenes scene as a `LidarSequence`; the lidar frame is the scanner's own frame."""
+    """A nuScenes scene as a `LidarSequence` in the frame of the scanner itself."""
 
     def __init__(self, tables: Path, token: str, name: str) -> None:
         self._tables, self._token, root = tables, token, tables.parent
@@ -288,7 +288,7 @@ class NuScenes(FileSequence):
         return self._track.at(self._stamps_ns[frame])
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes, lidar frame; None outside key frames or without annotations."""
+        """Return a sweep's boxes, lidar frame, or None without annotations at its time."""
         self.check_frame(frame)
         if self._annotations is None:
             return None

@@ -52,7 +52,7 @@ _HALF_WRAP = 1 << 15  # Ouster's packets count turns with 16 bits
 
 
 def open_recording(path: Path, scene: str | None) -> FileSequence:
-    """Return a ``.pcap`` capture; ``scene`` is a Velodyne's model or an Ouster's metadata file."""
+    """Return a ``.pcap`` capture. ``scene`` is a Velodyne's model or an Ouster's metadata file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected a capture of packets (.pcap)")
     if scene in MODELS:
@@ -70,7 +70,7 @@ def open_recording(path: Path, scene: str | None) -> FileSequence:
 
 
 def _find_metadata(path: Path) -> Path | None:
-    """Return a capture's .json: the longest name that begins its own, or the only one; or None."""
+    """Return the .json of a capture by their common begin, else the only one, else None."""
     json_files = sorted(path.parent.glob("*.json"))
     named = [p for p in json_files if path.stem.startswith(p.stem)]
     if named:
@@ -78,9 +78,10 @@ def _find_metadata(path: Path) -> Path | None:
     return json_files[0] if len(json_files) == 1 else None
 
 
-def _packet_counts(num: int, num_lost: int, num_twice: int) -> Sequence[tuple[str, str]]:
-    """Return the number of packets, and of those that are lost or were captured twice, in words."""
-    text = f"{num:,}, {num_lost:,} lost ({100 * num_lost / (num + num_lost):.1f} %)"
+def _packet_counts(num_read: int, num_lost: int, num_twice: int) -> Sequence[tuple[str, str]]:
+    """Return the numbers of packets read, lost, and captured twice, as one (name, text) pair."""
+    lost_percent = 100 * num_lost / (num_read + num_lost)
+    text = f"{num_read:,}, {num_lost:,} lost ({lost_percent:.1f} %)"
     return [("packets", f"{text}, {num_twice:,} captured twice and read once")]
 
 
@@ -102,6 +103,7 @@ class Velodyne(FileSequence):
         return _packet_counts(*self._packet_counts)
 
     def _returns(self, frame: int) -> Returns:
+        """Decode the packets of a turn into its returns."""
         library, packets = self._library, []
         with open_file(self.where) as file:
             for row in self._turns[frame]:
@@ -156,8 +158,9 @@ def _find_packets(path: Path) -> Int:
 
 
 def _once(packets: Int) -> tuple[Int, int]:
-    """Return packets (4,P) without those captured a second time, and the number of these."""
+    """Return the packets (4,P) without second captures, and the number of second captures."""
     _, captured_ns, azimuth, clock_us = packets
+    # Captures of one packet are neighbours in this order.
     order = np.lexsort((captured_ns, azimuth, clock_us))
     same = (np.diff(azimuth[order]) == 0) & (np.diff(clock_us[order]) == 0)
     twice = np.concatenate([[False], same & (np.diff(captured_ns[order]) < _TWICE_NS)])
@@ -176,11 +179,11 @@ def _num_lost(clock_us: Int) -> int:
 def _turns(azimuth: Int) -> list[range]:
     """Return the packet indices of each complete turn, from azimuths (P,) in 0.01 degrees."""
     from_behind = (azimuth - _BEHIND) % 36_000
-    first = [0, *(np.flatnonzero(np.diff(from_behind) < -_BEHIND) + 1).tolist(), len(azimuth)]
-    turns = [range(begin, end) for begin, end in pairwise(first)]
-    usual = np.median([len(turn) for turn in turns[1:-1] or turns])
-    ends = {turns[0], turns[-1]}
-    return [turn for turn in turns if turn not in ends or len(turn) >= _WHOLE * usual]
+    starts = (np.flatnonzero(np.diff(from_behind) < -_BEHIND) + 1).tolist()
+    turns = [range(begin, end) for begin, end in pairwise([0, *starts, len(azimuth)])]
+    usual_length = np.median([len(turn) for turn in turns[1:-1] or turns])
+    ends = {turns[0], turns[-1]}  # the capture may begin and end within a turn
+    return [turn for turn in turns if turn not in ends or len(turn) >= _WHOLE * usual_length]
 
 
 class Ouster(FileSequence):
@@ -224,6 +227,7 @@ class Ouster(FileSequence):
         return _packet_counts(len(packets) - num_twice, num_lost, num_twice)
 
     def _returns(self, frame: int) -> Returns:
+        """Decode a frame of the sensor, and time each column since the first measured one."""
         try:
             scan = self._source[frame][0]
             points = np.asarray(self._table(scan), np.float64)
@@ -247,11 +251,12 @@ class Ouster(FileSequence):
 
 
 def count_lost_and_repeated(turn: Int, column: Int) -> tuple[int, int]:
-    """Return the number of packets missing between P others, and of those captured twice.
+    """Return the number of packets missing between P others, and of repeated captures.
 
     ``turn`` (P,) numbers each packet's turn with 16 bits: 0 follows 65535.
     ``column`` (P,) is the first column of each packet.
     """
+    # Steps of the counter are unwrapped, then every packet of the sensor has a number of its own.
     step = np.diff(turn, prepend=turn[:1])
     turn = np.cumsum((step + _HALF_WRAP) % (2 * _HALF_WRAP) - _HALF_WRAP)
     sent_columns, rank = np.unique(column, return_inverse=True)

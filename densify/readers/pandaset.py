@@ -54,7 +54,7 @@ _LENGTH_WIDTH_HEIGHT = tuple(f"dimensions.{axis}" for axis in "yxz")
 
 
 def open_recording(path: Path, scene: str | None) -> PandaSet:
-    """Return the PandaSet sequence in a folder; ``scene`` is not used."""
+    """Return the PandaSet sequence in a folder, which has no scenes."""
     return PandaSet(path)
 
 
@@ -74,8 +74,8 @@ class PandaSet(FileSequence):
         T_world_lidar = T_world_pose @ T_POSE_LIDAR
         self._track = PoseTrack(str(lidar / "poses.json"), self._stamps_ns, T_world_lidar)
         # Where the vehicle moves little from pose to pose, interpolation errs little.
-        step_m = np.linalg.norm(np.diff(T_world_lidar[:, :3, 3], axis=0), axis=1)
-        step_m = np.pad(step_m, 1, constant_values=np.inf)
+        moved_m = np.linalg.norm(np.diff(T_world_lidar[:, :3, 3], axis=0), axis=1)
+        moved_m = np.pad(moved_m, 1, constant_values=np.inf)  # no images outside the poses
         images, cameras, exposed_ns = {}, {}, {}
         self._T_world_cam: dict[str, Float] = {}
         folders = sorted(path.glob("camera/*"), key=lambda p: (p.name != _FIRST_CAMERA, p.name))
@@ -86,8 +86,8 @@ class PandaSet(FileSequence):
                 images[name] = files
                 exposed_ns[name] = {number: int(images_ns[number]) for number in files}
                 # The mounting of the camera, from the image at which the vehicle moved least
-                steps = np.searchsorted(self._stamps_ns, images_ns[[*files]])
-                number = [*files][int(np.argmin(step_m[steps]))]
+                pose_after = np.searchsorted(self._stamps_ns, images_ns[[*files]])
+                number = [*files][int(np.argmin(moved_m[pose_after]))]
                 T_cam_world = poses.inverse(self._T_world_cam[name][number])
                 T_cam_lidar = T_cam_world @ self._track.at(exposed_ns[name][number])
                 cameras[name] = _camera(folder, files[min(files)], T_cam_lidar)
@@ -108,6 +108,7 @@ class PandaSet(FileSequence):
         return self._T_world_cam[camera][number]
 
     def _returns(self, frame: int) -> Returns:
+        """Read the points of a sweep, and move them from the world to where they were fired."""
         path, stamp_ns = self._files[frame], self.stamp_ns(frame)
         columns = read_pickled(path)
         x, y, z, brightness, time_s, scanner = (
@@ -134,7 +135,7 @@ class PandaSet(FileSequence):
         return self._track.at(self.stamp_ns(frame))
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return the boxes of a sweep in the lidar frame; None without a file of boxes."""
+        """Return the boxes of a sweep in the lidar frame, or None without a file of boxes."""
         self.check_frame(frame)
         path = self.where / "annotations" / "cuboids" / f"{frame:02d}.pkl.gz"
         if not path.is_file():
@@ -166,13 +167,13 @@ def _stamped_poses(folder: Path, last: int) -> tuple[Int, Float]:
             heading, position = entry["heading"], entry["position"]
             values = [heading[k] for k in "wxyz"], [position[k] for k in "xyz"]
             T.append(checks.quaternion_pose(*values, f"{path}: entry {number}"))
-    num = min(len(stamps_ns), len(T))
-    if last >= num:
+    num_entries = min(len(stamps_ns), len(T))
+    if last >= num_entries:
         raise InputError(
-            f"{folder}: got {num} entries in poses.json and timestamps.json, expected one for each "
-            f"file up to number {last}"
+            f"{folder}: got {num_entries} entries in poses.json and timestamps.json, expected one "
+            f"for each file up to number {last}"
         )
-    return stamps_ns[:num], np.stack(T[:num])
+    return stamps_ns[:num_entries], np.stack(T[:num_entries])
 
 
 def _camera(folder: Path, image: Path, T_cam_lidar: Float) -> Camera:

@@ -73,7 +73,7 @@ class PointTimes:
     reference: str
 
     def offset_ns(self, values: NDArray[Any], stamp_ns: int) -> tuple[Int, Bool]:
-        """Return point times (N,) as int64 ns since the stamp, 0 if invalid, and a valid mask."""
+        """Return (N,) int64 ns since the stamp, 0 for invalid times, and a mask of valid times."""
         times_ns, is_valid = self._times_ns(values, stamp_ns)
         offset_ns = np.zeros(len(values), np.int64)
         if is_valid.any():
@@ -84,12 +84,12 @@ class PointTimes:
         return offset_ns, is_valid
 
     def own_stamp_ns(self, values: NDArray[Any]) -> int | None:
-        """Return a stamp (ns) by a sweep's (N,) absolute point times; None if none is valid."""
+        """Return the stamp (ns) by a sweep's (N,) absolute times, or None if no time is valid."""
         times_ns, is_valid = self._times_ns(values, None)
         return self._reference_ns(times_ns[is_valid]) if is_valid.any() else None
 
     def _times_ns(self, values: NDArray[Any], stamp_ns: int | None) -> tuple[Int, Bool]:
-        """Return (N,) times in ns and a mask of those within `reach_ns` of the sweep's middle."""
+        """Return (N,) times in ns, and a mask of times within `reach_ns` of the sweep's middle."""
         unit_ns = UNIT_NS[self.unit]
         with np.errstate(invalid="ignore"):
             is_valid: Bool = np.abs(values.astype(np.float64)) < _LATEST_NS / unit_ns
@@ -103,8 +103,8 @@ class PointTimes:
 
     def _reference_ns(self, times_ns: Int) -> int:
         """Return the part of a sweep's valid times (M,) that `reference` names, else the start."""
-        first, last = int(times_ns.min()), int(times_ns.max())
-        return {"middle": (first + last) // 2, "end": last}.get(self.reference, first)
+        start_ns, end_ns = int(times_ns.min()), int(times_ns.max())
+        return {"middle": (start_ns + end_ns) // 2, "end": end_ns}.get(self.reference, start_ns)
 
     def __str__(self) -> str:
         text = f"{self.field} in {self.unit}, " + ("absolute" if self.absolute else "relative")
@@ -118,11 +118,11 @@ def _extent(times: NDArray[Any]) -> tuple[float, float]:
     # The shortest interval that holds half of the times: times farther from its middle than twice
     # its width are outlying.
     times = np.sort(times.astype(np.float64))
-    half = len(times) // 2
-    width = times[half:] - times[: len(times) - half]
-    first = int(np.argmin(width))
-    middle = times[first] + width[first] / 2
-    reach = 2 * width[first]
+    num_half = len(times) // 2
+    widths = times[num_half:] - times[: len(times) - num_half]
+    begin = int(np.argmin(widths))
+    middle = times[begin] + widths[begin] / 2
+    reach = 2 * widths[begin]
     inliers = times[np.abs(times - middle) <= reach]
     return float(inliers[0] + inliers[-1]) / 2, float(inliers[-1] - inliers[0]) / 2
 
@@ -144,7 +144,7 @@ def sample_columns(sweeps: Sequence[K], read: Callable[[K], Columns]) -> dict[K,
 
 
 class TimeField(NamedTuple):
-    """The user's settings of a field of point times; `find_times` detects those left empty."""
+    """The user's settings of a field of point times. `find_times` detects empty settings."""
 
     name: str
     unit: str = ""  # one of `UNIT_NS`
@@ -158,7 +158,7 @@ def find_times(
     period_ns: int,
     stamps_ns: Sequence[int] | None,
 ) -> tuple[PointTimes | None, str]:
-    """Return how to convert point times, None if that is impossible, and a text on it.
+    """Return how to convert a field of point times, or None, and a description or the reason.
 
     Args:
         field: Name of the field, and the user's settings.
@@ -202,6 +202,7 @@ def find_times(
         timed_ns = np.array([stamps_ns[row] for row in timed], np.float64)
         middle_ns = float(np.median(middles_ns - timed_ns))
     elif absolute:  # the stamps are made of these times
+        # Counted from the part of the sweep that becomes its stamp
         middle_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
     point_times = PointTimes(
         name,
@@ -216,9 +217,9 @@ def find_times(
 
 
 def _unit_of(span_in_periods: float) -> str:
-    """Return the unit in which a span, over the period in ns, fits a sweep; "" if none fits."""
-    shares = {unit: span_in_periods * unit_ns for unit, unit_ns in UNIT_NS.items()}
-    return next((unit for unit, share in shares.items() if _SHORTEST < share < _LONGEST), "")
+    """Return the unit in which a span, over the period in ns, is 0.08 to 4 periods, else ""."""
+    num_periods = {unit: span_in_periods * unit_ns for unit, unit_ns in UNIT_NS.items()}
+    return next((unit for unit, num in num_periods.items() if _SHORTEST < num < _LONGEST), "")
 
 
 def full_scale(intensity: NDArray[Any]) -> float:
@@ -228,9 +229,9 @@ def full_scale(intensity: NDArray[Any]) -> float:
 
 
 def rescale(intensity: NDArray[Any], scale: float) -> Float32:
-    """Return intensities divided by ``scale`` and clipped to 0 to 1; NaN and infinity give 0."""
-    share = np.nan_to_num(intensity.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0) / scale
-    return np.clip(share, 0, 1).astype(np.float32)
+    """Return intensities divided by ``scale``, clipped to 0 to 1, and 0 for NaN and infinity."""
+    finite = np.nan_to_num(intensity.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    return np.clip(finite / scale, 0, 1).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,11 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> Columns:
     the names of the first line, or x, y, z, intensity, column4, column5 and so on. Raise InputError
     if the file is damaged or holds no points.
 
-    .bin        float32 columns; without ``names``, those of KITTI, nuScenes or Waymo if size and
+    .bin        float32 columns. Without ``names``, those of KITTI, nuScenes or Waymo if size and
                 values fit one of them
-    .npy, .npz  an (N,3 or more) array, in an .npz called ``points``; or organised (H,W,3 or more);
-                or structured; or an .npz of x, y, z. Other arrays (N,) of an .npz are columns too.
-    .csv, .txt  numbers, NaN where blank; a first line of words names the columns
+    .npy, .npz  an (N,3 or more) array, called ``points`` in an .npz, or organised (H,W,3 or more),
+                or structured, or an .npz of x, y, z. Other arrays (N,) of an .npz are columns too
+    .csv, .txt  numbers, NaN where blank. A first line of words names the columns
     .pcd        ascii, binary, binary_compressed
     .ply        properties of its vertices (extra ``ply``)
     .las, .laz  dimensions
@@ -122,7 +122,7 @@ def _read_bin(path: Path, names: Sequence[str] | None) -> Columns:
 
 
 def _fits(data: bytes, num_columns: int) -> bool:
-    """Return True if size and values are those of the layout with this number of columns."""
+    """Return True if the size and values of .bin data fit the layout of this many columns."""
     if len(data) % (4 * num_columns):
         return False
     rows = np.frombuffer(data, "<f4").reshape(-1, num_columns)[:_ROWS_LOOKED_AT]
@@ -133,15 +133,15 @@ def _fits(data: bytes, num_columns: int) -> bool:
             return False
         if num_columns == 5:
             return bool(((rows[:, 4] % 1 == 0) & (rows[:, 4] < _MOST_RINGS)).all())
-        if num_columns == 6:  # a time, which ascends, is no elongation
+        if num_columns == 6:  # column 4 may be a time of another layout, but times ascend
             ascending = np.mean(np.diff(rows[:, 4]) >= 0)
             return bool(rows[:, 4].max() < _MOST_ELONGATION and ascending < _MOST_ASCENDING)
     return True
 
 
 def _are_scanned(points: NDArray[Any]) -> bool:
-    """Return True if consecutive (N,3) points are close to each other, as in a scan."""
-    # Rows read with a wrong number of columns mix x with y: then points lie far apart.
+    """Return True if consecutive (N,3) points are close to each other, because a scan is."""
+    # Rows read with a wrong number of columns mix x with y, and their points lie far apart.
     with np.errstate(invalid="ignore"):  # wrongly read bytes may be signalling NaN
         finite = np.nan_to_num(points.astype(np.float64), posinf=0, neginf=0)
     step = np.abs(np.diff(finite, axis=0)).sum(axis=1)
@@ -217,7 +217,8 @@ def _are_numbers(words: Sequence[str]) -> bool:
 
 
 def _pcd_header(file: Any) -> list[str]:
-    """Read the header up to DATA for the parser: no padding fields, nothing optional missing."""
+    """Read a .pcd header up to DATA, and return its lines as the parser expects them."""
+    # The parser knows no padding fields (COUNT 0) and no defaults of optional lines.
     table: dict[str, list[str]] = {}
     while "DATA" not in table and len(table) < 20:
         raw = file.readline(65536)

@@ -75,9 +75,10 @@ class PriorFiles:
         return f"there are {format_frames(self.values[camera])}"
 
     def prior(self, camera: Camera, number: int) -> Prior | None:
-        """Return an image's prior at the camera's size (H,W); None if it has no prior.
+        """Return an image's prior at the camera's size (H,W), or None if the image has no prior.
 
-        A prior of another size is resized if its aspect ratio agrees to 2 %; else raise InputError.
+        A prior of another size is resized. Raise InputError if its aspect ratio differs by over 2
+        %.
         """
         path = self.values[camera.name].get(number)
         if path is None:
@@ -90,14 +91,14 @@ class PriorFiles:
 
 def _find_numbered(folder: Path) -> dict[int, Path]:
     """Return the prior files of a folder or its ``data`` subfolder by image number."""
-    # A PNG may be only a preview of the .npy.
+    # Suffixes are ordered, because a PNG may be only a preview of the .npy.
     folders = (folder, folder / "data")
     numbered = (checks.numbered_files(path, *_SUFFIXES, stem=_STEM) for path in folders)
     return next(filter(None, numbered), {})
 
 
 def _read_values(path: Path) -> Float32:
-    """Read the (H,W) float32 values of a prior; 0 marks pixels without a value."""
+    """Read the values of a prior as (H,W) float32, 0 for pixels without a value."""
     read = {".npy": read_array, ".exr": _read_exr, ".png": _read_png}[path.suffix.lower()]
     image = read(path)
     image = image.squeeze() if image.ndim > 2 else image
@@ -145,12 +146,13 @@ def _read_png(path: Path) -> NDArray[Any]:
 
 
 def _resized(value: Float32, camera: Camera, path: Path) -> Float32:
-    """Resize values (H,W) to the camera's size; a pixel beside an empty pixel becomes 0 (empty)."""
+    """Resize values (H,W) to the camera's size, 0 for pixels beside an empty pixel."""
     if value.shape == (camera.height_px, camera.width_px):
         return value
     # Share of the pixels with a value that a resized pixel is interpolated from
     share = _at_size((value > 0).astype(np.float32), camera, path)
-    return np.where(share > 1 - 1e-3, _at_size(value, camera, path), 0).astype(np.float32)
+    is_full = share > 1 - 1e-3  # 1 but for rounding
+    return np.where(is_full, _at_size(value, camera, path), 0).astype(np.float32)
 
 
 def _read_sky(path: Path, camera: Camera) -> Bool:
@@ -162,7 +164,7 @@ def _read_sky(path: Path, camera: Camera) -> Bool:
 
 
 def _at_size(image: Float32, camera: Camera, path: Path) -> Float32:
-    """Resize an image linearly to the camera's size; raise InputError for another aspect ratio."""
+    """Resize an image linearly to the camera's size. Raise InputError for another aspect."""
     import cv2
 
     height, width = image.shape

@@ -47,7 +47,7 @@ class PoseTrack:
             )
 
     def at(self, time_ns: int) -> Float:
-        """Return T_world_ego (4,4) at a time, interpolated, up to 0.2 s beyond; else InputError."""
+        """Return the (4,4) T_world_ego at a time. Raise InputError over 0.2 s beyond the poses."""
         begin, end = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
         beyond_ns = max(begin - time_ns, time_ns - end)
         if beyond_ns > _MAX_BEYOND_NS:
@@ -64,14 +64,13 @@ class PoseTrack:
         return poses.interpolate(self.T_world_ego[before], self.T_world_ego[after], fraction)
 
     def undo_compensation(self, points: Float, stamp_ns: int, offset_ns: Int) -> Float:
-        """Return points in the vehicle frame at their firing times; undo ego-motion compensation.
+        """Return points (N,3) as measured, in the vehicle frame at each point's own firing time.
 
         Many data sets store a sweep as if measured at one time, which smears moving objects and
         bends rings.
 
         Args:
-            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``; padding at 0 0 0
-                stays.
+            points: (N,3) metres, compensated to the vehicle frame at ``stamp_ns``. 0 0 0 stays.
             stamp_ns: Time to which the points are compensated.
             offset_ns: (N,) firing times since ``stamp_ns``.
         """
@@ -94,7 +93,7 @@ class PoseTrack:
         return replace(placed, points=points)
 
     def _motion_since(self, stamp_ns: int, offset_ns: Int) -> tuple[Rotation, Float]:
-        """Return N rotations and shifts (N,3): poses at the firing times in that at the stamp."""
+        """Return N rotations and shifts (N,3): poses at firing times in the pose at the stamp."""
         # Poses relative to the pose at the stamp, at the ends of the sweep and at stored poses
         T_ref_world = poses.inverse(self.at(stamp_ns))
         begin_ns, end_ns = stamp_ns + int(offset_ns.min()), stamp_ns + int(offset_ns.max())
@@ -102,7 +101,7 @@ class PoseTrack:
         times_ns = [begin_ns, *self.stamp_ns[is_inside].tolist(), max(end_ns, begin_ns + 1)]
         T_ref_ego = np.stack([T_ref_world @ self.at(time_ns) for time_ns in times_ns])
         since_ns = np.array([time_ns - stamp_ns for time_ns in times_ns], np.float64)
-        # Interpolation between them
+        # The pose at each firing time is interpolated between these poses.
         fired_ns, row = np.unique(offset_ns, return_inverse=True)  # many points share a firing time
         turns = Slerp(since_ns, Rotation.from_matrix(T_ref_ego[:, :3, :3]))(fired_ns)[row]
         shifts_m = [np.interp(fired_ns, since_ns, axis) for axis in T_ref_ego[:, :3, 3].T]
@@ -110,7 +109,7 @@ class PoseTrack:
 
 
 def transform_from_world(placed: Float, T_world_ego: Float) -> Float:
-    """Return world points (N,3) in the frame of a pose (4,4). Padding at 0 0 0 stays."""
+    """Return world points (N,3) in the frame of a pose (4,4), except padding at 0 0 0."""
     points = poses.transform(poses.inverse(T_world_ego), placed)
     return np.where(placed.any(axis=1, keepdims=True), points, placed)
 
@@ -129,7 +128,7 @@ class PoseFile:
     def of_folder(
         folder: Path, name: str, unit: str, sweeps: Mapping[int, Path]
     ) -> PoseFile | None:
-        """Return the poses of a recording; None without any.
+        """Return the poses of a recording, or None without any.
 
         ``name`` is the pose file. "" searches for a usual name, a .pose file beside each of the
         ``sweeps`` (file by frame), or the viewpoints of .pcd files. ``unit`` is the unit of the
@@ -157,7 +156,7 @@ class PoseFile:
 
     @staticmethod
     def read(path: Path, unit: str = "") -> PoseFile:
-        """Return the poses of a file, one on each line; ``unit`` is the times', "" to find it."""
+        """Return the poses of a file with a pose on each line."""
         table = TextTable.read(path, [name for names in _TURNS for name in names])
         columns = [i for names in (*_TURNS, *_POSITIONS) if (i := table.column(names)) is not None]
         width, form, time = len(table.rows[0]), "table with quaternions", None
@@ -194,7 +193,7 @@ class PoseFile:
         return PoseFile(next(iter(paths.values())), form, T, frames=tuple(paths))
 
     def by_frame(self, frames: Sequence[int]) -> dict[int, Float]:
-        """Return frame number -> (4,4) pose; ``frames`` are the recording's, ascending.
+        """Return frame number -> (4,4) pose for the recording's ``frames``, ascending.
 
         Poses of files for each sweep keep their frames. As many poses as ``frames`` are in their
         order. More poses than the last frame number belong to the numbers from 0. Otherwise raise

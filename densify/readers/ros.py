@@ -22,6 +22,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
@@ -48,7 +49,7 @@ _NO_PICTURES = re.compile(r"depth|disparity|theora|mask|confidence")
 
 
 def open_recording(path: Path, scene: str | None) -> RosBag:
-    """Return a bag; ``scene`` names topics, such as ``points=/lidar&images=none``, None to find."""
+    """Return a bag. ``scene`` names topics to read: ``points=/lidar&images=none``, None: detect."""
     return RosBag(path, scene)
 
 
@@ -93,7 +94,7 @@ class Topics(NamedTuple):
 
 
 def _only_cloud(bag: Bag) -> str:
-    """Return the only topic of point clouds; raise InputError for no or several topics."""
+    """Return the only topic of point clouds. Raise InputError for no or several topics."""
     clouds = bag.of_type(*CLOUDS)
     if len(clouds) == 1:
         return clouds[0].name
@@ -130,7 +131,7 @@ def _listed(topics: Iterable[Topic]) -> str:
 
 
 class Transforms:
-    """The tree of coordinate frames of a bag; a frame that never moves in /tf is fixed."""
+    """The tree of coordinate frames of a bag. A frame that never moves in /tf is fixed."""
 
     def __init__(self, bag: Bag) -> None:
         """Read all transforms of /tf_static and /tf."""
@@ -142,7 +143,7 @@ class Transforms:
         recorded: dict[tuple[str, str], dict[int, Float]] = defaultdict(dict)
         for topic in bag.of_type(*ros_bag.TRANSFORMS):
             messages = bag.messages(topic.name)
-            for transform in (t for message in messages for t in message.transforms):
+            for transform in chain.from_iterable(message.transforms for message in messages):
                 parent, child = _plain(transform.header.frame_id), _plain(transform.child_frame_id)
                 where = f"{bag.path}: {topic.name}: {parent} to {child}"
                 T = _pose(transform.transform.translation, transform.transform.rotation, where)
@@ -161,7 +162,7 @@ class Transforms:
                 self._moving[child] = (parent, track)
 
     def between(self, target: str, source: str) -> Float | None:
-        """Return the constant T_target_source (4,4); None if no fixed frames join the two."""
+        """Return the constant T_target_source (4,4), or None if no fixed frames join the two."""
         T_above_target, T_above_source = self._above(target), self._above(source)
         for ancestor in T_above_source:
             if ancestor in T_above_target:
@@ -169,7 +170,7 @@ class Transforms:
         return None
 
     def track_of(self, frame: str) -> tuple[str, PoseTrack] | None:
-        """Return a frame's moving parent and T_parent_frame over time; None if nothing moves."""
+        """Return a frame's moving parent and T_parent_frame over time, or None if nothing moves."""
         # The nearest moving parent is usually odom, not map, which jumps at loop closures.
         for body, T_body_frame in self._above(frame).items():
             if body in self._moving:
@@ -208,6 +209,7 @@ def _recorded_track(bag: Bag, topic: str, transforms: Transforms, lidar: str) ->
 
 
 def _track(where: str, T_at_stamp: dict[int, Float]) -> PoseTrack:
+    """Return poses by stamp (ns) as a track in the order of time."""
     T = np.reshape([T_at_stamp[stamp] for stamp in sorted(T_at_stamp)], (-1, 4, 4))
     return PoseTrack(where, np.array(sorted(T_at_stamp), np.int64), T)
 
@@ -242,7 +244,7 @@ class Lidar(NamedTuple):
 
 
 class RosBag(FileSequence):
-    """A ROS bag as a `LidarSequence`; the lidar frame is the frame of the first lidar."""
+    """A ROS bag as a `LidarSequence`. The lidar frame is the frame of the first lidar."""
 
     def __init__(self, path: Path, options: str | None = None) -> None:
         """Index the bag: read all stamps, transforms and calibrations, and sample sweeps."""
@@ -299,7 +301,7 @@ class RosBag(FileSequence):
         ]
 
     def _returns(self, frame: int) -> Returns:
-        # The message of the first lidar, and those of other lidars nearest in time
+        # A sweep joins a message of the first lidar with the nearest messages of other lidars.
         stamp_ns = self._stamps_ns[frame]
         clouds: list[Returns] = []
         for number, lidar in enumerate(self._lidars):
@@ -383,12 +385,12 @@ class RosBag(FileSequence):
         frame = _plain(self._bag.message(topic, next(iter(columns_of_entry))).header.frame_id)
         placed_frame = self._frame_placed_in(frame)
         frame = placed_frame or frame
-        first = self._lidars[0].frame if self._lidars else frame
-        T = self._transforms.between(first, frame)
+        first_frame = self._lidars[0].frame if self._lidars else frame
+        T = self._transforms.between(first_frame, frame)
         if T is None:
             raise InputError(
                 f"{self._bag.path}: nothing in /tf_static joins the frame {frame} of {topic} to "
-                f"{first}; name the topic of one lidar: #points={topic}"
+                f"{first_frame}; name the topic of one lidar: #points={topic}"
             )
         period_ns = median_period_ns([entry.stamp_ns for entry in entries])
         stamps_ns = [entry.stamp_ns for entry in columns_of_entry]
@@ -405,7 +407,7 @@ class RosBag(FileSequence):
         return _plain(getattr(message, "child_frame_id", "")) or "lidar"
 
     def _camera(self, topic: str) -> Camera:
-        """Return the camera of a topic; raise InputError without images, CameraInfo or mounting."""
+        """Return the camera of a topic. Raise InputError without images, CameraInfo or mounting."""
         where, namespace = f"{self._bag.path}: {topic}", _namespace(topic)
         info = f"{namespace}/camera_info"
         message = next(self._bag.messages(info), None) if info in self._bag.topics else None

@@ -91,11 +91,11 @@ class Topic(NamedTuple):
 
 
 class Bag:
-    """A ROS 1 or ROS 2 bag, opened for reading; raises InputError if it is missing or damaged."""
+    """A ROS 1 or ROS 2 bag, opened for reading. A missing or damaged bag raises InputError."""
 
     def __init__(self, path: Path) -> None:
-        # A .bag, .db3 or .mcap file, the folder of a ROS 2 bag, or a folder of .bag files that are
-        # parts of one recording
+        # Path of a .bag, .db3 or .mcap file, of a ROS 2 bag's folder, or of a folder with the .bag
+        # files of one recording
         self.path = path
         self._files = _bag_files(path)
         self._is_ros2 = not (self._files[0].suffix == ".bag" and self._files[0].is_file())
@@ -145,7 +145,7 @@ class Bag:
         return {topic: sorted(entries) for topic, entries in entries_of_topic.items()}
 
     def message(self, topic: str, entry: Entry) -> Any:
-        """Return the decoded message of an index entry; InputError if it is missing or damaged."""
+        """Return the decoded message of an index entry. Raise InputError if damaged or missing."""
         recorded = list(self._messages([topic], entry.log_ns, entry.log_ns + 1))
         if len(recorded) <= entry.turn:
             raise InputError(f"{self.path}: no message of {topic} at {entry.log_ns} ns any more")
@@ -206,7 +206,7 @@ def message_types(is_ros2: bool) -> Any:
 
 
 def _mcap_profile(file: Path) -> str | None:
-    """Return the profile that a whole MCAP file states, "" for none; None for other files."""
+    """Return the profile that a whole MCAP file states, "" for none, or None for other files."""
     if not file.is_file():
         return None
     with open_file(file) as opened:
@@ -268,7 +268,7 @@ def _stamp_ns(raw: bytes, is_ros2: bool) -> int:
 
 
 def cloud_columns(message: Any, where: str) -> dict[str, NDArray[Any]]:
-    """Return a cloud message's fields of one number by name, (N,) as stored; else InputError."""
+    """Return the single numbers of a cloud message by name, (N,) as stored, or raise InputError."""
     if not hasattr(message, "point_step"):
         rows = [tuple(getattr(point, name) for name in _LIVOX) for point in message.points]
         table = np.array(rows, list(_LIVOX.items()))
@@ -391,7 +391,8 @@ def _lens(named: str, distortion: tuple[float, ...], where: str) -> tuple[str, t
 
 def _binned(camera: Camera, info: Any) -> Camera:
     """Adjust a camera to the region of interest and the binning of a CameraInfo."""
-    # Binning averages sensor pixels, which moves pixel centres relative to the corner.
+    # Binning averages sensor pixels. Coordinates from the image's corner, which lies half a pixel
+    # before the centre of the first pixel, shrink by the binning.
     region = info.roi
     binning = np.array([max(1, info.binning_x), max(1, info.binning_y)])
     size = [region.width or camera.width_px, region.height or camera.height_px]

@@ -31,7 +31,7 @@ _MAX_NUMBER_DIGITS = 18  # a longer number is no frame number
 
 
 def _to_ns(text: str, unit: str) -> int:
-    """Convert a decimal number in ``unit`` to ns, exactly; raise ValueError if impossible."""
+    """Convert a decimal number in ``unit`` to ns, exactly. Raise ValueError if impossible."""
     try:
         value = Decimal(text)
     except InvalidOperation:
@@ -45,7 +45,7 @@ def _to_ns(text: str, unit: str) -> int:
 
 
 def date_ns(text: str) -> int:
-    """Return an ISO date in UTC as ns since 1970, without loss; ValueError for other texts."""
+    """Return an ISO date in UTC as ns since 1970, exactly. Raise ValueError for other texts."""
     day = np.datetime64(text, "D")  # numpy wraps years beyond 64 bits
     if not np.datetime64("1970-01-01") <= day < np.datetime64("2262-01-01"):
         raise ValueError(f"got {text!r}, expected a year from 1970 to 2261")
@@ -74,7 +74,7 @@ class TextTable(NamedTuple):
 
     @staticmethod
     def read(path: Path, known: Collection[str]) -> TextTable:
-        """Return the table of a file; the first line has names if one is known or if it has a #."""
+        """Return a file's table. A first line with a known name or a # has the column names."""
         names, lines, rows = list[str](), list[int](), list[list[str]]()
         for number, line in enumerate(read_text(path).splitlines(), 1):
             text = re.sub(r"(\d-\d\d) (\d\d:)", r"\1T\2", line.strip().strip("#,;").strip())
@@ -101,9 +101,9 @@ class TextTable(NamedTuple):
         return next((index for index in indices if index < len(self.rows[0])), None)
 
     def times_ns(self, column: int, unit: str) -> tuple[tuple[int, ...], str]:
-        """Return the times of a column in nanoseconds, and the unit in the file ("date" for dates).
+        """Return the times of a column in ns, and their unit in the file, "date" for dates.
 
-        ``unit`` "" finds the unit of times since 1970 by their size; others are in seconds.
+        ``unit`` "" detects the unit of times since 1970 by their size. Other times are in seconds.
         """
         times = [words[column] for words in self.rows]
         dates = "-" in times[0][1:] and ":" in times[0]
@@ -149,7 +149,7 @@ class StampFile(NamedTuple):
 
     @staticmethod
     def read(path: Path, unit: str = "") -> StampFile:
-        """Return the times in a file's lines, dates or numbers of ``unit``; "" finds the unit."""
+        """Return the times of a file's lines: dates, or numbers of ``unit``, "" to detect it."""
         table = TextTable.read(path, (*TIME_COLUMNS, *_FILE_COLUMNS))
         time_column = table.column(TIME_COLUMNS)
         name_column = table.column(_FILE_COLUMNS)
@@ -205,7 +205,7 @@ class NamedFile(NamedTuple):
 
     @staticmethod
     def of(path: Path, unit: str = "") -> NamedFile:
-        """Return the number or the time in a name; with a ``unit``, its last number is a time."""
+        """Return the number or the time in a name. With a ``unit``, the last number is a time."""
         # 0000000120 and cloud_12 are numbers. 1317042651.468569638, 1317042651_468569638 and
         # 1317042651468 are times since 1970.
         words = re.findall(r"\d+(?:\.\d+)?", _SECONDS_AND_NS.sub(r"\1.\2", path.stem))
@@ -234,7 +234,9 @@ class Series(NamedTuple):
 def order_files(
     root: Path, paths: Sequence[Path], stamps: str, unit: str, shared: bool = True
 ) -> Series:
-    """Return files in the order of time; those whose names are times are numbered from 0.
+    """Return files in the order of time, numbered from 0 if their names are times.
+
+    Raise InputError if a stamp is missing or the stamps do not ascend.
 
     Args:
         root: Folder of the recording.
@@ -242,7 +244,7 @@ def order_files(
         stamps: "names" if file names are stamps, "sweeps" for files without stamps, the name of a
             stamp file beside the files or below ``root``, or "" to search for one.
         unit: Unit of the stamps, "" to detect it.
-        shared: True to search in ``root`` too.
+        shared: True to search for a stamp file in ``root`` too.
     """
     by_names = stamps == "names"
     names = [NamedFile.of(path, unit if by_names else "") for path in paths]
@@ -275,7 +277,7 @@ def order_files(
 
 
 def _numbered(names: Sequence[NamedFile]) -> dict[int, NamedFile]:
-    """Return the files by number; files whose names are times are numbered from 0 in order."""
+    """Return the files by number, counted from 0 in the order of time if names are times."""
     if any(name.number is None for name in names):
         return dict(enumerate(sorted(names, key=lambda name: (name.stamp_ns or 0, name.path))))
     ordered = sorted(names, key=lambda name: (name.number, name.path))
@@ -297,7 +299,7 @@ def _stamp_file(root: Path, folder: Path, name: str, shared: bool) -> Path | Non
 
 
 def require_path(folder: Path, name: str, key: str, is_folder: bool = False) -> Path:
-    """Return the file or folder ``name`` that densify.yaml gives as ``key``; InputError without."""
+    """Return the path that densify.yaml gives as ``key``. Raise InputError if it is missing."""
     path = folder / name
     if not (path.is_dir() if is_folder else path.is_file()):
         kind = "folder" if is_folder else "file"
@@ -306,7 +308,7 @@ def require_path(folder: Path, name: str, key: str, is_folder: bool = False) -> 
 
 
 def files_below(root: Path, suffixes: Sequence[str], depth: int) -> dict[str, list[Path]]:
-    """Return the visible files by folder relative to ``root``, at most ``depth`` levels down."""
+    """Return the visible files by folder relative to ``root``, ``depth`` levels deep at most."""
     files_of_folder = {}
     for folder, subfolders, names in os.walk(root):
         # os.walk visits the subfolders that remain in the list.

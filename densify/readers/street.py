@@ -50,7 +50,7 @@ _NUMBERS = "expected degrees of tilt from -45 to 45, hz 5, 10, 20, seed a whole 
 
 
 class Street:
-    """The built-in simulated street, 16 seconds long; members as in `LidarSequence`."""
+    """The built-in simulated street, 16 seconds long, with the members of a `LidarSequence`."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Street:
         tilt_deg: float = 0.0,
         cameras: tuple[str, ...] = USUAL,
     ) -> None:
-        """Set up the street; sweeps and images are rendered on demand. InputError for other values.
+        """Set up the street. Values that are unknown or out of range raise InputError.
 
         Args:
             preset: "street", "highway", "static" (only the ego vehicle moves) or "crossing" (the
@@ -133,7 +133,7 @@ class Street:
         return in_one_line(self)
 
     def stamp_ns(self, frame: int) -> int:
-        """Return the reference time of a sweep (ns)."""
+        """Return the reference time of a sweep in nanoseconds since 1970."""
         self.check(frame)
         return self.simulator.stamp_ns(frame)
 
@@ -162,7 +162,7 @@ class Street:
         return self.picture(camera, number).image
 
     def image_stamps_ns(self, camera: str) -> Mapping[int, int]:
-        """Return the exposure times (ns) of a camera's images, by image number from 0."""
+        """Return the exposure times in ns of a camera's images, by image number from 0."""
         _check("camera", camera, self.cameras)
         return self.simulator.image_stamps_ns(camera)
 
@@ -172,7 +172,7 @@ class Street:
         return get_cached(self._cache, "bodies", lambda: self._posed, lambda: self.simulator.bodies)
 
     def _from_cache(self, step: str, scene: str, render: Callable[..., Any], *which: Any) -> Any:
-        """Return a cached result, or render and keep it; ``scene`` and ``which`` identify it."""
+        """Return the result for ``scene`` and ``which`` from the cache, or render and keep it."""
 
         def rendered() -> Any:
             _announce()
@@ -195,7 +195,7 @@ class Street:
 
 @dataclass(frozen=True)
 class StreetTruth:
-    """Exact ground truth of a simulated street; members as in `Truth`."""
+    """Exact ground truth of a simulated street, with the members of `Truth`."""
 
     _street: Street
 
@@ -217,12 +217,15 @@ class StreetTruth:
         return self._street.picture(camera, number).depth_m
 
     def moving_mask(self, camera: str, number: int) -> Bool:
-        """Return a mask (H,W) of an image, True for pixels of moving objects."""
+        """Return the mask (H,W) of an image, True for pixels of moving objects.
+
+        An object counts as moving if it moves around the reference time nearest to the exposure.
+        """
         body = self._street.picture(camera, number).body
         simulator, frames = self._street.simulator, self._street.frames
         since_ns = simulator.image_stamps_ns(camera)[number] - simulator.stamp_ns(0)
-        frame = min(max(round(since_ns / simulator.period_ns), 0), frames[-1])
-        moving: Bool = (body >= 0) & self._street.bodies.moving[frame][body]
+        nearest = min(max(round(since_ns / simulator.period_ns), 0), frames[-1])
+        moving: Bool = (body >= 0) & self._street.bodies.moving[nearest][body]
         return moving
 
 
@@ -234,11 +237,13 @@ def write_bodies(folder: Path, bodies: Bodies) -> None:
 def write_points(
     folder: Path, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], point: Float
 ) -> None:
-    """Write the ground truth of a sweep's N raw points, row by row.
+    """Write the ground truth of a sweep's N raw points, row by row, to ``points/FRAME.npz``.
 
     Args:
-        body: (N,) index of the body of each point.
-        instance: (N,) number of its object, -1 for none.
+        folder: Folder ``truth`` of the recording.
+        frame: Frame number of the sweep.
+        body: (N,) index of the body that each point is on.
+        instance: (N,) number of the point's object, -1 for none.
         point: (N,3) position in metres in the frame of the body.
     """
     path = folder / "points" / f"{frame:010d}.npz"
@@ -263,7 +268,7 @@ class FileTruth:
         self.bodies = Bodies(*self._load("bodies.npz", *_BODIES))
 
     def sweep(self, frame: int) -> SweepTruth:
-        """Return the ground truth of a sweep's N raw points, in the lidar frame at its stamp."""
+        """Return the ground truth of a sweep's N raw points, lidar frame at its reference time."""
         body, instance, point = self._points(frame)
         return self.bodies.sweep(frame, body, instance, point)
 

@@ -107,7 +107,7 @@ class Timeline:
 
     @cached_property
     def period_ns(self) -> int:
-        """Median time between consecutive sweeps in nanoseconds; 100 ms for a single sweep."""
+        """Median time between consecutive sweeps in ns, 100 ms for a single sweep."""
         return median_period_ns(self.stamp_ns)
 
     def num_in(self, duration_s: float) -> int:
@@ -182,8 +182,8 @@ class Timeline:
             frame = self.frames[row]
             if self._hole_before(max(row, row - step)):
                 gap_s = abs(int(self.stamp_ns[row] - self.stamp_ns[row - step])) * 1e-9
-                first, second = sorted((previous, frame))
-                return side, f"{gap_s:.1f} s lie between frames {first} and {second}"
+                earlier, later = sorted((previous, frame))
+                return side, f"{gap_s:.1f} s lie between frames {earlier} and {later}"
             if frame in left_out:
                 return side, left_out[frame]
             side.append(frame)
@@ -196,10 +196,11 @@ class Timeline:
 
 
 def _out_of_order(stamps_ns: Int) -> list[int]:
-    """Return indices of stamps outside the longest ascending series; [] if they are half of all."""
+    """Return indices of stamps outside the longest ascending series, [] for half of all stamps."""
     if np.all(np.diff(stamps_ns) > 0):
         return []
-    # Longest increasing subsequence, by patience sorting
+    # Longest increasing subsequence by patience sorting: a stamp continues the longest series
+    # that ends below the stamp.
     end_by_length: list[int] = []  # index of the lowest stamp that ends a series of each length
     previous: list[int] = []  # index of the stamp before each in its series, -1 for none
     for row, stamp_ns in enumerate(stamps_ns.tolist()):
@@ -218,7 +219,7 @@ def _out_of_order(stamps_ns: Int) -> list[int]:
 
 
 def read_sweep(sequence: LidarSequence, frame: int, settings: RegisterSettings) -> Sweep:
-    """Return a sweep after `remove_unusable_returns`, without firing times if not ``deskew``."""
+    """Return a sweep without unusable returns, and without firing times if not ``deskew``."""
     sweep = remove_unusable_returns(sequence[frame], settings)
     return sweep if settings.deskew else replace(sweep, offset_ns=None)
 
@@ -239,7 +240,7 @@ def remove_unusable_returns(sweep: Sweep, settings: RegisterSettings) -> Sweep:
 
 
 def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list[Camera]:
-    """Return the cameras of these names in this order; raise InputError for an unknown name.
+    """Return the cameras of these names in this order. Raise InputError for an unknown name.
 
     For None, return the cameras with images, or all cameras if none has images.
     """
@@ -257,7 +258,7 @@ def choose_cameras(sequence: LidarSequence, names: Sequence[str] | None) -> list
 
 
 def recorded_trajectory(sequence: LidarSequence, sweeps: Sequence[Sweep]) -> Trajectory:
-    """Return the recorded poses of the sweeps at their reference times; InputError without any."""
+    """Return the recorded poses of sweeps at their stamps. Raise InputError without poses."""
     return Trajectory(
         frames=tuple(sweep.frame for sweep in sweeps),
         stamp_ns=np.array([sweep.stamp_ns for sweep in sweeps], np.int64),

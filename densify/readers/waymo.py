@@ -60,7 +60,7 @@ def full_name(component: str, column: str) -> str:
 
 
 class Segment(NamedTuple):
-    """The Parquet tables of the segment named ``context``; ``root`` is the split's folder."""
+    """The Parquet tables of the segment named ``context`` in the split's folder ``root``."""
 
     root: Path
     context: str
@@ -72,7 +72,7 @@ class Segment(NamedTuple):
     def read(
         self, component: str, kinds: Mapping[str, str], where: Mapping[str, int] | None = None
     ) -> dict[str, NDArray[Any]]:
-        """Return columns (N,) by short name; ``kinds`` and ``where`` are as in `read_arrow`."""
+        """Return columns (N,) by short name, with the arguments of `read_arrow`."""
         full_kinds = {full_name(component, name): kind for name, kind in kinds.items()}
         path, data_set = self.file(component), ("waymo", "Waymo recordings")
         columns = read_arrow(path, full_kinds, data_set, where)
@@ -96,7 +96,8 @@ class Laser(NamedTuple):
             low, high = self.bounds_rad
             beams = (np.arange(height) + 0.5) / height * (high - low) + low
         T = self.T_vehicle_laser
-        # Azimuths of the pixel centres fall from pi to -pi in the vehicle's frame.
+        # Azimuths of pixel centres fall from pi to -pi in the vehicle's axes, in which the lidar's
+        # x axis points to mount_rad.
         mount_rad = np.arctan2(T[1, 0], T[0, 0])
         azimuth = ((np.arange(width, 0, -1) - 0.5) / width * 2 - 1) * np.pi - mount_rad
         inclination = beams[::-1, None]  # the first row is the highest beam
@@ -131,7 +132,7 @@ def _read_lasers(segment: Segment) -> dict[int, Laser]:
 
 
 def _read_images(segment: Segment, starts_us: Int) -> dict[str, dict[int, Image]]:
-    """Return times and poses of images by camera and frame; ``starts_us`` (n,) are the frames'."""
+    """Return times and poses of images by camera and frame. ``starts_us`` (n,) are of frames."""
     keys = ("shutter", "camera_trigger_time", "camera_readout_done_time")
     seconds = ("pose_timestamp", *(f"rolling_shutter_params.{key}" for key in keys))
     kinds = {STAMP: "i", CAMERA: "i", "pose.transform": "l", **dict.fromkeys(seconds, "n")}
@@ -181,12 +182,12 @@ def _read_cameras(
 
 
 def _whole_us(seconds: float) -> int:
-    """Convert seconds since 1970 to ns in whole µs; float64 resolves about 0.25 µs."""
+    """Convert seconds since 1970 to ns, rounded to µs, because float64 resolves about 0.25 µs."""
     return round(seconds * 1e6) * 1000
 
 
 def open_recording(path: Path, scene: str | None) -> Waymo:
-    """Return the segment ``scene`` (CONTEXT) of a split's folder; None for the only one."""
+    """Return the segment ``scene`` (CONTEXT) of a split's folder, the only segment for None."""
     names = sorted(file.stem for file in (path / "lidar").glob("*.parquet"))
     example = "lidar/10017090168044687777_6380_000_6400_000.parquet"
     none = f"no segments; expected files such as {example}"
@@ -225,7 +226,7 @@ class Waymo(FileSequence):
         return self._T_world_vehicle[frame]
 
     def boxes(self, frame: int) -> Boxes | None:
-        """Return a sweep's boxes in the vehicle's frame; None without annotations of this sweep."""
+        """Return a sweep's boxes in the vehicle's frame, or None without annotations for it."""
         self.check_frame(frame)
         return self._boxes.get(int(self._starts_us[frame]))
 
@@ -267,7 +268,7 @@ class Waymo(FileSequence):
             points.append(np.where(image[..., 0].reshape(-1, 1) > 0, in_vehicle, np.nan))
             intensity.append(np.tanh(image[..., 1].ravel()))
             column_ns = begin_ns + (np.arange(width) + 0.5) / width * self._period_ns
-            if number != 1:  # not TOP: taken to be at the stamp
+            if number != 1:  # other lidars than TOP are assumed to fire at the stamp
                 column_ns = np.zeros(width)
             offset_ns.append(np.tile(np.rint(column_ns).astype(np.int64), height))
             lidar.append(np.full(len(in_vehicle), number - 1, np.uint8))

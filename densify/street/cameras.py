@@ -51,14 +51,14 @@ T_RECTIFIED_LIDAR = _pose(
 
 
 def _pinhole(name: str, row: Any) -> Camera:
-    """Return a pinhole camera with a share of KITTI's resolution."""
-    share = 1 / getattr(row, "one_in", 1)
+    """Return a pinhole camera with a fraction of KITTI's resolution, from its row of the table."""
+    scale = 1 / getattr(row, "one_in", 1)
     # The centre of the first pixel is at 0, and its outer corner at -0.5.
-    u, v = ((coordinate + 0.5) * share - 0.5 for coordinate in _RECTIFIED.centre_px)
-    K = _intrinsics(_RECTIFIED.focal_px * share, u, v)
+    u, v = ((coordinate + 0.5) * scale - 0.5 for coordinate in _RECTIFIED.centre_px)
+    K = _intrinsics(_RECTIFIED.focal_px * scale, u, v)
     T_cam_lidar = T_RECTIFIED_LIDAR.copy()
     T_cam_lidar[0, 3] -= row.right_m
-    width_px, height_px = (round(size * share) for size in _RECTIFIED.size_px)
+    width_px, height_px = (round(size * scale) for size in _RECTIFIED.size_px)
     row_time_s = getattr(row, "row_time_s", 0.0)
     return Camera(name, width_px, height_px, K, T_cam_lidar, row_time_s=row_time_s)
 
@@ -90,7 +90,7 @@ def T_level_lidar(tilt_deg: float) -> Float:
 
 
 def cameras_beside(tilt_deg: float, names: tuple[str, ...] = USUAL) -> dict[str, Camera]:
-    """Return name -> camera, which is level, with its pose relative to the tilted lidar."""
+    """Return the cameras by name, which are level, with poses relative to the tilted lidar."""
     T = T_level_lidar(tilt_deg)
     return {
         name: replace(CAMERAS[name], T_cam_lidar=CAMERAS[name].T_cam_lidar @ T) for name in names
@@ -114,18 +114,19 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
     Pixels outside the view of the lens are black, with depth 0 and body -1.
 
     Args:
+        world: Bodies to render.
         ego: Motion of the ego vehicle.
         camera: Camera whose pose is relative to a lidar on a level mount.
         time_s: Exposure of the middle row, in seconds since frame 0.
     """
-    h, w = camera.height_px, camera.width_px
-    v, u = np.divmod(np.arange(h * w, dtype=np.float64), w)
+    height, width = camera.height_px, camera.width_px
+    v, u = np.divmod(np.arange(height * width, dtype=np.float64), width)
     ray = rays(camera, np.column_stack([u, v]))
     # Pixels outside the view of the lens have no ray and stay black.
     in_view = np.flatnonzero(np.isfinite(ray[:, 0]))
     ray = ray[in_view]
     # Rays in the world at the exposure of their rows
-    exposed_s = time_s + (v[in_view] - (h - 1) / 2) * camera.row_time_s
+    exposed_s = time_s + (v[in_view] - (height - 1) / 2) * camera.row_time_s
     poses = poses_at(ego, exposed_s)
     T_ego_cam = T_ego_lidar() @ inverse(camera.T_cam_lidar)
     origin = poses.apply(np.broadcast_to(T_ego_cam[:3, 3], ray.shape))
@@ -142,13 +143,14 @@ def expose(world: World, ego: Driving, camera: Camera, time_s: float) -> Picture
 
     depth_m = hits.range_m * ray[:, 2] if camera.measure == "z" else hits.range_m
     is_near = np.isfinite(depth_m) & (depth_m <= _MAX_DEPTH_M)
-    image = np.zeros((h * w, 3), np.uint8)
+    image = np.zeros((height * width, 3), np.uint8)
     image[in_view] = np.rint(255 * np.clip(colour, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
-    depth = np.zeros(h * w, np.float32)
+    depth = np.zeros(height * width, np.float32)
     depth[in_view] = np.where(is_near, depth_m, 0.0)
-    body = np.full(h * w, -1, np.int32)
+    body = np.full(height * width, -1, np.int32)
     body[in_view] = np.where(hits.triangle >= 0, world.triangles.body[hits.triangle], -1)
-    return Picture(image.reshape(h, w, 3), depth.reshape(h, w), body.reshape(h, w))
+    size = height, width
+    return Picture(image.reshape(*size, 3), depth.reshape(size), body.reshape(size))
 
 
 def through_glass(world: World) -> Optics:
@@ -158,7 +160,7 @@ def through_glass(world: World) -> Optics:
 
 
 def _colours(world: World, rays: Rays, hits: Hits) -> Float:
-    """Return (N,3) linear RGB of the ray hits: sun with shadows, sky light and haze."""
+    """Return the (N,3) linear RGB that rays show: sunlight, shadows, light of the sky, and haze."""
     light = _TABLES.light
     is_hit = hits.triangle >= 0
     colour = np.empty(rays.direction.shape)
@@ -168,7 +170,7 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
     material = world.triangles.material[triangle]
     direction = rays.direction[rows]
     range_m = hits.range_m[rows, None]
-    # Normals are turned towards the camera.
+    # Normals of triangles have either sign, and are turned towards the camera.
     normal = hits.normal[rows]
     facing = np.einsum("ni,ni->n", normal, direction)
     normal = np.where(facing[:, None] > 0, -normal, normal)
@@ -193,28 +195,30 @@ def _colours(world: World, rays: Rays, hits: Hits) -> Float:
 
 
 def _sunlight(world: World, surface: Rays, material: Int) -> Float:
-    """Return (N,) shares of sunlight, 0 in a shadow; ``surface`` has points and their normals."""
+    """Return the (N,) strengths of sunlight at ``surface``, whose directions are normals."""
     light = _TABLES.light
     sun = np.array(light.towards_sun) / np.linalg.norm(light.towards_sun)
     cosine = surface.direction @ sun
     through_leaf = light.leaf.least + light.leaf.facing * np.abs(cosine)
-    share = np.where(material == Material.LEAF, through_leaf, np.maximum(cosine, 0.0))
-    sunny = np.flatnonzero(share > 0)
+    strength = np.where(material == Material.LEAF, through_leaf, np.maximum(cosine, 0.0))
+    sunny = np.flatnonzero(strength > 0)
     towards = np.tile(sun, (len(sunny), 1))
     shadow = Rays(surface.origin[sunny], towards, surface.time_s[sunny])
-    lit = np.zeros(len(share))
+    lit = np.zeros(len(strength))  # 1 in the sun, 0 in a shadow
     lit[sunny] = ~np.isfinite(world.cast(shadow, through_glass(world)).range_m)
-    return lit * share
+    return lit * strength
 
 
 def _sky(direction: Float) -> Float:
-    """Return (N,3) linear RGB of the sky in (N,3) directions."""
+    """Return the (N,3) linear RGB of the sky in (N,3) unit directions."""
     sky, cloud = _TABLES.light.sky, _TABLES.light.cloud
     up = np.clip(direction[:, 2], 0.0, 1.0)[:, None]
-    low = (1 - up) ** 3
-    blue = np.array(sky.horizon) * low + np.array(sky.zenith) * (1 - low)
+    horizon_share = (1 - up) ** 3
+    blue = np.array(sky.horizon) * horizon_share + np.array(sky.zenith) * (1 - horizon_share)
+    # Clouds are noise on a plane at height 1, which each direction meets at ``flat``.
     height = (direction[:, 2:] + cloud.above_horizon).clip(cloud.least)
     flat = direction[:, :2] / height * cloud.size
+    # Octave i has half the size and half the weight of the octave before.
     octaves = [_smooth_noise(flat + _OCTAVE_SHIFT * i, 0.5**i) / 2**i for i in range(_NUM_OCTAVES)]
     density = sum(octaves) / sum(0.5**i for i in range(_NUM_OCTAVES))
     cover = np.clip((density - cloud.begins) * cloud.contrast, 0, cloud.most)[:, None]
@@ -226,6 +230,7 @@ def _painted(world: World, triangle: Int, barycentric: Float32) -> Float:
     """Return the (N,3) colours of points on triangles: material, tint and texture."""
     uv = world.triangles.uv[triangle]
     material = world.triangles.material[triangle]
+    # position = (1 - b - c) uv_0 + b uv_1 + c uv_2, with the barycentric coordinates b and c
     weight_1, weight_2 = barycentric.astype(np.float64).T[:, :, None]
     position = uv[:, 0] * (1 - weight_1 - weight_2) + uv[:, 1] * weight_1 + uv[:, 2] * weight_2
     brightness = np.ones(len(material))

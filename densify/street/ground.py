@@ -44,15 +44,15 @@ class Road:
         return stations, cKDTree(self.curve(stations))
 
     def distance(self, xy: Float) -> Float:
-        """Return the (N,) metres from (N,2) points, world, to the strip's edge, negative inside."""
+        """Return the metres from world points (N,2) to the strip as (N,), negative inside."""
         stations, tree = self._samples
         station = stations[tree.query(xy)[1]]
         for _ in range(_NUM_STEPS):  # from the nearest sample to the foot of the perpendicular
             foot, tangent = self.curve.with_tangent(station)
             away = xy - foot
             station = station + np.einsum("ni,ni->n", away, tangent)
-        offset = away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1]  # to the left
-        to_side_m = np.maximum(offset - self.left_m, -self.right_m - offset)
+        left_of_centre_m = away[:, 1] * tangent[:, 0] - away[:, 0] * tangent[:, 1]
+        to_side_m = np.maximum(left_of_centre_m - self.left_m, -self.right_m - left_of_centre_m)
         to_end_m = np.maximum(-station, station - self.curve.length_m)
         return np.maximum(to_side_m, to_end_m)
 
@@ -67,19 +67,20 @@ class Ground:
     pavement_m: float  # width of the pavement beside the roads
 
     def distance(self, xy: Float) -> Float:
-        """Return the (N,) metres from (N,2) points, world, to the kerb, negative on the road."""
-        # Union of the strips with rounded inner corners, as signed distance fields are joined
-        distance = self.roads[0].distance(xy)
+        """Return the metres from world points (N,2) to the kerb as (N,), negative on roads."""
+        # Union of signed distances a and b with inner corners of radius r:
+        # max(r, min(a, b)) - hypot(max(r - a, 0), max(r - b, 0))
+        distance_m = self.roads[0].distance(xy)
         radius_m = _CORNER_RADIUS_M
         for road in self.roads[1:]:
-            to_road = road.distance(xy)
-            distance = np.maximum(radius_m, np.minimum(distance, to_road)) - np.hypot(
-                np.maximum(radius_m - distance, 0), np.maximum(radius_m - to_road, 0)
+            to_road_m = road.distance(xy)
+            distance_m = np.maximum(radius_m, np.minimum(distance_m, to_road_m)) - np.hypot(
+                np.maximum(radius_m - distance_m, 0), np.maximum(radius_m - to_road_m, 0)
             )
-        return distance
+        return distance_m
 
     def height(self, xy: Float) -> Float:
-        """Return the (N,) heights in metres of the surface at (N,2) points, kerbs included."""
+        """Return the heights (N,) of the surface in metres at world points (N,2), with kerbs."""
         return self.terrain.height(xy) + self.kerb_m * (self.distance(xy) > 0)
 
     def mesh(self, margin_m: float, cell_m: float) -> Mesh:
@@ -95,7 +96,7 @@ class Ground:
         return Mesh.join([fine, self._coarse(low, high, margin_m)])
 
     def _fine(self, xy: Float, distance: Float, triangles: Float) -> Mesh:
-        """Return triangles cut at the edge of the carriageway, and the upright kerb."""
+        """Return the mesh of triangles, cut at the edge of the road, and of the upright kerb."""
         # Triangles are cut along the zero line of the signed distance to the kerb.
         is_on_road = distance[triangles] < 0
         num_on_road = is_on_road.sum(axis=1)
@@ -111,7 +112,7 @@ class Ground:
             corner = np.take_along_axis(corner, (lone[:, None] + np.arange(3)) % 3, axis=1)
             a, b, c = xy[corner.T]
             to_kerb_a, to_kerb_b, to_kerb_c = distance[corner.T, None]
-            # Points of the kerb on the sides a-b and a-c
+            # Points of the kerb on the sides a-b and a-c, where the linear distance is 0
             ab = a + (b - a) * to_kerb_a / (to_kerb_a - to_kerb_b)
             ac = a + (c - a) * to_kerb_a / (to_kerb_a - to_kerb_c)
             quad_halves = [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
@@ -157,13 +158,13 @@ class Ground:
 
 
 def _grid(low: Float, high: Float, cell_m: float) -> tuple[Float, Float]:
-    """Return the corners (N,2) of a regular grid and its cells (M,4), anticlockwise."""
+    """Return the corners (N,2) of a regular grid, and the corner indices (M,4) of its quads."""
     num_x, num_y = (int(np.ceil(num_cells)) + 1 for num_cells in (high - low) / cell_m)
     x, y = np.meshgrid(low[0] + cell_m * np.arange(num_x), low[1] + cell_m * np.arange(num_y))
     corners = np.column_stack([x.ravel(), y.ravel()])
-    first = (np.arange(num_y - 1)[:, None] * num_x + np.arange(num_x - 1)).ravel()
-    above = first + num_x
-    return corners, np.stack([first, first + 1, above + 1, above], axis=1)
+    lower_left = (np.arange(num_y - 1)[:, None] * num_x + np.arange(num_x - 1)).ravel()
+    upper_left = lower_left + num_x  # corners are row by row, quads go round anticlockwise
+    return corners, np.stack([lower_left, lower_left + 1, upper_left + 1, upper_left], axis=1)
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ class Side:
     end_m: float  # last station
 
     def at(self, station_m: float, beyond_kerb_m: float) -> Float:
-        """Return the (2,) point, metres, world, ``beyond_kerb_m`` outside the kerb at a station."""
+        """Return the world point (2,), ``beyond_kerb_m`` metres outside the kerb at a station."""
         station = np.array([station_m])
         edge_m = self.road.left_m if self.side > 0 else self.road.right_m
         normal = self.road.curve.normal(station)[0] * self.side
@@ -189,7 +190,7 @@ class Side:
         return float(np.arctan2(-forward[1], -forward[0]))
 
     def forward(self, station_m: float) -> Float:
-        """Return the (2,) unit vector, world, of this side's traffic, which keeps to the right."""
+        """Return the world unit vector (2,) of this side's traffic, which keeps to the right."""
         tangent: Float = self.road.curve.tangent(np.array([station_m]))[0] * -self.side
         return tangent
 

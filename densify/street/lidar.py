@@ -77,7 +77,7 @@ class Raster(_Steady):
     lines_per_s: int  # swings of the fast mirror per second, counting each direction
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
+        """Return the unit vectors (N,3), x forward, at (N,) indices and times in periods and s."""
         line = number * (self.lines_per_s / self.pulses_per_s)
         swing = 1 - np.abs(line % 2 - 1)  # from 0 to 1 in one line, back to 0 in the next
         azimuth = np.radians(self.width_deg) * (0.5 - swing)
@@ -93,10 +93,12 @@ class Rosette(_Steady):
     turns_per_s: tuple[float, float]
 
     def directions(self, number: Int, share: Float, time_s: Float) -> Float:
-        """Return (N,3) unit vectors, x forward, by (N,) index, firing time in periods, and in s."""
-        first, second = (np.pi * rate * time_s for rate in self.turns_per_s)
-        axis_angle = np.radians(self.width_deg / 2) * np.cos(first - second)
-        roll, sine = first + second, np.sin(axis_angle)
+        """Return the unit vectors (N,3), x forward, at (N,) indices and times in periods and s."""
+        # Each prism bends the ray towards its own angle. Two equal bends add up to one of the mean
+        # direction, whose size varies with the difference of the angles.
+        half_angle_1, half_angle_2 = (np.pi * rate * time_s for rate in self.turns_per_s)
+        axis_angle = np.radians(self.width_deg / 2) * np.cos(half_angle_1 - half_angle_2)
+        roll, sine = half_angle_1 + half_angle_2, np.sin(axis_angle)
         return np.stack([np.cos(axis_angle), sine * np.cos(roll), sine * np.sin(roll)], axis=1)
 
 
@@ -129,7 +131,7 @@ class Sensor:
     scanners: tuple[Scanner, ...]  # a return's scanner is an index into these
 
     def each(self, field: str) -> Float:
-        """Return the values of the named field of all S scanners, as an array (S,) or (S,3)."""
+        """Return the values of a field of all S scanners, as an array (S,) or (S,3)."""
         return np.array([getattr(scanner, field) for scanner in self.scanners], np.float64)
 
     @property
@@ -140,9 +142,9 @@ class Sensor:
     @property
     def azimuth_tells_time(self) -> bool:
         """True if azimuth determines firing time: one scanner that spins about the origin."""
-        first = self.scanners[0]
-        spins = isinstance(first.pattern, Spinning)
-        return len(self.scanners) == 1 and spins and not any(first.origin_m)
+        scanner = self.scanners[0]
+        spins = isinstance(scanner.pattern, Spinning)
+        return len(self.scanners) == 1 and spins and not any(scanner.origin_m)
 
 
 def _elevations_deg(row: Any) -> Float:
@@ -156,8 +158,8 @@ def _elevations_deg(row: Any) -> Float:
     elif hasattr(row, "beyond"):
         degrees = row.beyond + row.step * steps
     else:
-        first, last = row.widening
-        degrees = first + (last - first) * (steps / row.num) ** _WIDENING
+        start, end = row.widening
+        degrees = start + (end - start) * (steps / row.num) ** _WIDENING
     return degrees[::-1] if hasattr(row, "backwards") else degrees
 
 
@@ -188,16 +190,16 @@ class Firings:
 
 
 def firings(sensor: Sensor, time_s: float, period_ns: int) -> Firings:
-    """Return a sweep's pulses, evenly spaced about its middle ``time_s``, seconds since frame 0."""
+    """Return a sweep's pulses, evenly spaced about its middle, ``time_s`` seconds after frame 0."""
     pulses = []
     for index, scanner in enumerate(sensor.scanners):
-        num = scanner.pattern.num_pulses(period_ns * _S_PER_NS)
-        number = np.arange(num, dtype=np.int64)
-        offset_ns = -period_ns // 2 + number * period_ns // num
+        num_pulses = scanner.pattern.num_pulses(period_ns * _S_PER_NS)
+        number = np.arange(num_pulses, dtype=np.int64)
+        offset_ns = -period_ns // 2 + number * period_ns // num_pulses
         share: Float = offset_ns / period_ns
         fired_s = time_s + share * period_ns * _S_PER_NS
         direction = scanner.pattern.directions(number, share, fired_s)
-        pulses.append((direction, offset_ns, np.full(num, index, np.uint8)))
+        pulses.append((direction, offset_ns, np.full(num_pulses, index, np.uint8)))
     direction, offset_ns, lidar = (np.concatenate(column) for column in zip(*pulses, strict=True))
     order = np.argsort(offset_ns, kind="stable")
     return Firings(direction[order], offset_ns[order], lidar[order])
@@ -223,7 +225,7 @@ _RARE = 1e-9  # least probability that is converted to a normal quantile
 
 
 def laser(world: World, luck: Float) -> Optics:
-    """Return the optics of lidar; ``luck`` (N,) has a random number from 0 to 1 for each ray."""
+    """Return the optics of lidar. ``luck`` (N,) has a random number from 0 to 1 for each ray."""
     surfaces = world.triangles
 
     def optics(met: Meeting) -> Int:
@@ -257,7 +259,7 @@ def laser(world: World, luck: Float) -> Optics:
 
 
 def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
-    """Return the (N,) shares of pulses lost, by (N,) materials, tint factors and ranges (m)."""
+    """Return the (N,) shares of pulses without a return, by material, tint factor and range (m)."""
     table = _TABLES.lost_elsewhere
     ground, dark, bright = (
         np.interp(range_m, table.range_m, shares)
@@ -270,7 +272,7 @@ def share_lost(material: Int, tint: Float, range_m: Float) -> Float:
 def patches(position: Float, owner: Int) -> Float:
     """Return (N,) random numbers from 0 to 1 that vary smoothly over the surface of an object.
 
-    ``position`` (N,3) has points in metres, ``owner`` (N,) the numbers of their objects.
+    ``position`` (N,3) are points in metres, ``owner`` (N,) the numbers of their objects.
     """
     # Normal random numbers at the corners of a grid of cells are interpolated.
     cell = np.floor(position / _PATCH_M)
@@ -285,7 +287,7 @@ def patches(position: Float, owner: Int) -> Float:
     for axis_share in share.T:  # each axis halves the number of corners
         low, high = np.split(normal, 2)
         normal = low + axis_share * (high - low)
-    # Interpolation lowers the variance; the division restores it.
+    # Interpolation with weights w lowers the variance to the sum of w², which the division undoes.
     variance = np.prod(share**2 + (1 - share) ** 2, axis=1)
     smooth: Float = ndtr(normal[0] / np.sqrt(variance))
     return smooth
@@ -335,7 +337,7 @@ def T_ego_lidar(tilt_deg: float = 0.0) -> Float:
 
 
 class Mount(NamedTuple):
-    """A sensor on the ego vehicle."""
+    """A sensor on the ego vehicle, with the duration of its sweeps."""
 
     ego: Driving  # motion of the vehicle
     sensor: Sensor
@@ -344,14 +346,14 @@ class Mount(NamedTuple):
 
 
 def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) -> Returns:
-    """Return the simulated returns of a mounted sensor's sweep; ``rng`` draws noise and losses.
+    """Return the simulated returns of a mounted sensor's sweep.
 
-    The middle of the sweep is at ``time_s``, in seconds since frame 0.
+    The middle of the sweep is ``time_s`` seconds after frame 0. ``rng`` draws noise and losses.
     """
     sensor = mount.sensor
     T = T_ego_lidar(mount.tilt_deg)
     fired = firings(sensor, time_s, mount.period_ns)
-    n = len(fired.offset_ns)
+    num_pulses = len(fired.offset_ns)
 
     # Five rays for each pulse, in the world frame
     times = at_offsets(time_s, fired.offset_ns)
@@ -359,21 +361,21 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
     origin_m = sensor.origins_m[fired.lidar]
     origin = ego_poses.apply(transform(T, sensor.origins_m)[fired.lidar])
     spot = _spot(fired.direction) @ (ego_poses.rotation @ T[:3, :3]).transpose(0, 2, 1)
-    luck = rng.random((len(_SPOT), n)).T
+    luck = rng.random((len(_SPOT), num_pulses)).T
     rays = Rays(origin.repeat(len(_SPOT), axis=0), spot.reshape(-1, 3), times.repeat(len(_SPOT)))
     hits = world.cast(rays, laser(world, luck.ravel()), len(_SPOT), 2 * _SPOT_RAD)
 
-    # One echo for each pulse, and whether the receiver detects it
+    # One echo for each pulse, and whether the receiver detects the echo
     range_m, ray, is_edge = _strongest_echoes(hits, spot, rng)
     triangle = hits.triangle[ray]
     material, tint = world.triangles.material[triangle], world.triangles.mean_tint[triangle]
     probability = 1 - share_lost(material, tint, range_m)
     probability = probability * np.where(is_edge, _EDGE_HEARD, 1.0)
-    keep = np.isfinite(range_m) & (rng.random(n) < probability)
+    keep = np.isfinite(range_m) & (rng.random(num_pulses) < probability)
 
     # Noise of the range, and points in the lidar frame
     range_m = np.where(keep, range_m, 0.0)
-    range_m += sensor.each("range_sigma_m")[fired.lidar] * rng.normal(size=n)
+    range_m += sensor.each("range_sigma_m")[fired.lidar] * rng.normal(size=num_pulses)
     keep &= (range_m > _MIN_RANGE_M) & (range_m < sensor.each("max_range_m")[fired.lidar])
     points = fired.direction * range_m[:, None]
     np.add(points, origin_m, out=points, where=origin_m != 0)  # a coordinate of -0.0 stays -0.0
@@ -382,7 +384,7 @@ def scan(world: World, mount: Mount, time_s: float, rng: np.random.Generator) ->
     reflectivity = REFLECTIVITY[material] * (_UNTINTED + (1 - _UNTINTED) * tint)
     cosine = np.abs(np.einsum("ni,ni->n", hits.normal[ray], spot[:, 0]))
     brightness = reflectivity * (_GRAZING + (1 - _GRAZING) * cosine)
-    brightness *= 1 + _NOISE * rng.normal(size=n)
+    brightness *= 1 + _NOISE * rng.normal(size=num_pulses)
     return Returns(
         points[keep].astype(np.float32),
         np.clip(np.round(brightness[keep], 2), 0, 1).astype(np.float32),
@@ -400,7 +402,7 @@ def at_offsets(time_s: float, offset_ns: Int) -> Float:
 
 
 def _spot(direction: Float) -> Float:
-    """Return (N,5,3) ray directions of N beams: spot centre, then four around it."""
+    """Return the (N,5,3) ray directions of N beams: the centre of the spot, then four around it."""
     left = np.stack([-direction[:, 1], direction[:, 0], np.zeros(len(direction))], axis=1)
     left /= lengths(left)
     upward = np.cross(direction, left)
@@ -411,16 +413,18 @@ def _spot(direction: Float) -> Float:
 def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> tuple[Float, Int, Bool]:
     """Return the strongest echo of each laser spot, from the hits of its (N,5,3) rays.
 
-    It is (N,) ranges, inf without a hit; (N,) indices of the rays whose surface counts; and a mask
-    (N,), True for spots at an edge.
+    Returns:
+        (N,) ranges in metres, inf without a hit. (N,) indices of the rays whose surface
+        counts. A mask (N,), True for spots at an edge.
     """
     # On one plane the centre ray counts. At an edge each ray is equally likely to be the strongest
     # echo. Two echoes close together sometimes merge into one at a range in between.
-    n, num = spot.shape[:2]
-    range_m = hits.range_m.reshape(n, num)
+    num_spots, num_rays = spot.shape[:2]
+    range_m = hits.range_m.reshape(num_spots, num_rays)
 
     # A spot is at an edge if a ray does not end in the plane of the centre ray's surface.
-    slant = np.einsum("ni,nsi->ns", hits.normal[::num], spot)
+    # Along ray s, the plane through the centre echo is at range_0 (n · ray_0) / (n · ray_s).
+    slant = np.einsum("ni,nsi->ns", hits.normal[::num_rays], spot)
     with np.errstate(divide="ignore", invalid="ignore"):  # a ray without a hit has infinite range
         plane_distance = np.abs(range_m - (range_m * slant)[:, :1] / slant)
     is_hit = np.isfinite(range_m)
@@ -428,15 +432,15 @@ def _strongest_echoes(hits: Hits, spot: Float, rng: np.random.Generator) -> tupl
 
     # One of the rays with a hit is chosen at random; a second ray may merge with it.
     edges = np.flatnonzero(is_edge)
-    choice = np.argmax(rng.random((num, n))[:, edges] * is_hit[edges].T, axis=0)
+    choice = np.argmax(rng.random((num_rays, num_spots))[:, edges] * is_hit[edges].T, axis=0)
     chosen_m = range_m[edges, choice]
-    partner_m = range_m[edges, rng.integers(num, size=(n,))[edges]]
-    merges = np.isfinite(partner_m) & (rng.random((n,))[edges] < _MELT_PROBABILITY)
+    partner_m = range_m[edges, rng.integers(num_rays, size=(num_spots,))[edges]]
+    merges = np.isfinite(partner_m) & (rng.random((num_spots,))[edges] < _MELT_PROBABILITY)
     merges[merges] = np.abs(partner_m[merges] - chosen_m[merges]) < _MERGE_M
     chosen_m[merges] = (chosen_m[merges] + partner_m[merges]) / 2
 
     echo_m = range_m[:, 0].copy()
     echo_m[edges] = chosen_m
-    ray = np.arange(0, n * num, num)  # centre rays
-    ray[edges] = edges * num + choice
+    ray = np.arange(0, num_spots * num_rays, num_rays)  # centre rays
+    ray[edges] = edges * num_rays + choice
     return echo_m, ray, is_edge

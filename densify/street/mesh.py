@@ -70,7 +70,7 @@ class Mesh:
 
     @staticmethod
     def join(meshes: Sequence[Mesh]) -> Mesh:
-        """Return the union of meshes. At least one of them must have a triangle."""
+        """Return the union of meshes, of which at least one must have a triangle."""
         meshes = [mesh for mesh in meshes if len(mesh.triangles)]
         columns = {
             field.name: np.concatenate([getattr(mesh, field.name) for mesh in meshes])
@@ -88,7 +88,7 @@ class Mesh:
 
         Texture x is along the first side. ``tint`` is (3,) for all quads or (K,3).
         """
-        corners, num = np.asarray(corners, float), len(corners)
+        corners, num_quads = np.asarray(corners, float), len(corners)
         first_side = corners[:, 1] - corners[:, 0]
         last_side = corners[:, 3] - corners[:, 0]
         # Two perpendicular axes in the plane of each quad are the axes of its texture.
@@ -98,15 +98,15 @@ class Mesh:
         halves = np.array([0, 1, 2, 0, 2, 3])  # corners of the two triangles of a quad
         return Mesh(
             vertices=corners.reshape(-1, 3),
-            triangles=(np.arange(0, 4 * num, 4)[:, None] + halves).reshape(-1, 3),
+            triangles=(np.arange(0, 4 * num_quads, 4)[:, None] + halves).reshape(-1, 3),
             uv=np.einsum("kci,kai->kca", corners, axes).reshape(-1, 2),
-            material=np.full(2 * num, material, np.int16),
-            tint=np.repeat(np.broadcast_to(tint, (num, 3)), 2, axis=0),
-            instance=np.full(2 * num, -1, np.int32),
+            material=np.full(2 * num_quads, material, np.int16),
+            tint=np.repeat(np.broadcast_to(tint, (num_quads, 3)), 2, axis=0),
+            instance=np.full(2 * num_quads, -1, np.int32),
         )
 
     def posed(self, T_a_mesh: Float) -> Mesh:
-        """Return the mesh in frame a, where ``T_a_mesh`` (4,4) is the pose of its present frame."""
+        """Return the mesh in frame a, given the pose ``T_a_mesh`` (4,4) of its present frame."""
         return replace(self, vertices=self.vertices @ T_a_mesh[:3, :3].T + T_a_mesh[:3, 3])
 
     def of_instance(self, instance: int) -> Mesh:
@@ -186,35 +186,34 @@ def tube(
 
 
 def ball(centre: Point, radius_m: Point, material: Material, tint: Tint = WHITE) -> Mesh:
-    """Return an ellipsoid of 6 rings and 10 sectors with the radii (3,) along x, y and z."""
+    """Return an ellipsoid with the radii (3,) along x, y and z, of 6 rings and 10 sectors."""
     latitude, longitude = np.meshgrid(
         np.linspace(-np.pi / 2, np.pi / 2, 6 + 1), np.linspace(0, 2 * np.pi, 10 + 1), indexing="ij"
     )
-    level = np.cos(latitude)
-    unit = np.stack(
-        [level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=2
-    )
-    p = unit * np.asarray(radius_m) + np.asarray(centre)  # (ring, sector, 3)
-    corners = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
+    x, y = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude)
+    unit = np.stack([x, y, np.sin(latitude)], axis=2)
+    points = unit * np.asarray(radius_m) + np.asarray(centre)  # (ring, sector, 3)
+    below, above = points[:-1], points[1:]
+    corners = np.stack([below[:, :-1], below[:, 1:], above[:, 1:], above[:, :-1]], axis=2)
     return Mesh.quads(corners.reshape(-1, 4, 3), material, tint)
 
 
 def leaves(centres: Float, size_m: float, rng: np.random.Generator, tint: Tint = WHITE) -> Mesh:
-    """Return randomly turned squares at ``centres`` (K,3), metres, each a bunch of leaves."""
-    num = len(centres)
+    """Return squares at ``centres`` (K,3), metres, turned at random, each a bunch of leaves."""
+    num_leaves = len(centres)
     # Unit vectors along the sides of each square
-    u = rng.normal(size=(num, 3))
+    u = rng.normal(size=(num_leaves, 3))
     u /= lengths(u)
-    v = np.cross(u, rng.normal(size=(num, 3)))
+    v = np.cross(u, rng.normal(size=(num_leaves, 3)))
     v /= lengths(v)
-    half = (size_m * rng.uniform(*_LEAF_SIZES, num))[:, None]
+    half = (size_m * rng.uniform(*_LEAF_SIZES, num_leaves))[:, None]
     corners = [centres + half * (i * u + j * v) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    tints = np.asarray(tint) * rng.uniform(*_LEAF_TINTS, (num, 1))
+    tints = np.asarray(tint) * rng.uniform(*_LEAF_TINTS, (num_leaves, 1))
     return Mesh.quads(np.stack(corners, axis=1), Material.LEAF, tints)
 
 
 def lengths(vectors: Float) -> Float:
-    """Return the (N,1) lengths of vectors (N,3), faster than np.linalg.norm."""
+    """Return the lengths (N,1) of vectors (N,3), faster than np.linalg.norm."""
     squared = vectors * vectors
     return np.sqrt(squared[:, :1] + squared[:, 1:2] + squared[:, 2:])
 
@@ -226,7 +225,7 @@ _DOUBLE_BITS = 53
 
 
 def noise(i: Int, j: Int) -> Float:
-    """Return (N,) random numbers in [0, 1), always the same for the same integers, (N,) each."""
+    """Return random numbers (N,) in [0, 1), always the same for the same two integers (N,)."""
     h = i.astype(np.uint64) * _PRIMES[0]
     h ^= j.astype(np.uint64) * _PRIMES[1]
     h ^= h >> np.uint64(29)

@@ -42,7 +42,7 @@ class Actor:
 
 @lru_cache(_CACHED_MODELS)
 def model(name: str, **parameters: Any) -> Mesh:
-    """Return a mesh of models.yaml; ``parameters`` are values of the names that its rows use."""
+    """Return a mesh of models.yaml, with values (``parameters``) for the names in its rows."""
     return Mesh.join([_solid(solid, parameters) for solid in getattr(_SHAPES, name)])
 
 
@@ -59,11 +59,11 @@ def _solid(row: Any, parameters: dict[str, Any]) -> Mesh:
     make, offsets = _SOLIDS[fields.pop("solid")], fields.pop("at", None)
     if "spaced" in fields:
         spaced = fields.pop("spaced")
-        first, end = (resolve(end, parameters) for end in (spaced.first, spaced.end))
-        steps = np.arange(first, end, spaced.step_m)
+        begin_m, end_m = (resolve(end, parameters) for end in (spaced.first, spaced.end))
+        along_m = np.arange(begin_m, end_m, spaced.step_m)
         gap_m = resolve(getattr(spaced, "from_middle_m", 0.0), parameters)
         axis = np.eye(3)["xyz".index(spaced.axis)]
-        offsets = steps[np.abs(steps) >= gap_m, None] * axis
+        offsets = along_m[np.abs(along_m) >= gap_m, None] * axis
     if offsets is None:
         return make(**fields)
     if make is box:  # `box` makes many boxes at once
@@ -73,7 +73,7 @@ def _solid(row: Any, parameters: dict[str, Any]) -> Mesh:
 
 
 def resolve(value: Any, parameters: Mapping[str, Any]) -> Any:
-    """Return a value with names replaced by parameters; a pair [name, number] gives the sum."""
+    """Return a value with names replaced by parameters, and [name, number] by their sum."""
     if isinstance(value, str):
         return parameters.get(value, value)
     if not isinstance(value, list):
@@ -250,7 +250,7 @@ def tree(rng: np.random.Generator) -> tuple[Mesh, Mesh]:
             tube(start, tip, shape.branch_radius_m, Material.BARK, num_sides=shape.branch_sides)
         )
 
-    # Leaves fill the outer part of a lumpy ellipsoid.
+    # Leaves fill the outer part of an ellipsoid, scaled by 1 + depth sin(x + phase) cos(y).
     num_leaves = int(shape.leaves_per_m * spread)
     direction = rng.normal(size=(num_leaves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)

@@ -38,18 +38,18 @@ class Curve:
         return self.with_tangent(station_m)[0]
 
     def with_tangent(self, station_m: Float) -> tuple[Float, Float]:
-        """Return the (N,2) points of the curve at (N,) arc lengths, and its `tangent` there."""
+        """Return the points (N,2) of the curve and its directions (N,2) at (N,) arc lengths."""
         inside = np.clip(station_m, 0.0, self.length_m)
         tangent = self.tangent(inside)
         return self._spline(inside) + (station_m - inside)[..., None] * tangent, tangent
 
     def tangent(self, station_m: Float) -> Float:
-        """Return (N,2) unit directions of travel at (N,) arc lengths."""
+        """Return the unit directions of travel (N,2) at (N,) arc lengths."""
         slope: Float = self._slope(np.clip(station_m, 0.0, self.length_m))
         return slope / np.linalg.norm(slope, axis=-1, keepdims=True)
 
     def normal(self, station_m: Float) -> Float:
-        """Return (N,2) unit vectors to the left of the direction of travel at (N,) arc lengths."""
+        """Return the unit vectors (N,2) to the left of the curve at (N,) arc lengths."""
         return left_of(self.tangent(station_m))
 
     @staticmethod
@@ -62,6 +62,7 @@ class Curve:
         """
         step = _FINE_M
         station = np.arange(0.0, length_m + step, step)
+        # heading = ∫ curvature ds, position = ∫ (cos heading, sin heading) ds
         heading = np.concatenate([[0.0], np.cumsum(curvature(station[:-1] + step / 2) * step)])
         middle = (heading[1:] + heading[:-1]) / 2
         steps = step * np.stack([np.cos(middle), np.sin(middle)], axis=1)
@@ -82,7 +83,10 @@ class Lane:
     """A path along a road: its centreline shifted sideways, possibly driven backwards."""
 
     def __init__(self, road: Curve, offset_m: float, forward: bool = True) -> None:
-        """Build the lane, ``offset_m`` to the left of the road's centreline."""
+        """Build the lane, ``offset_m`` to the left of the road's centreline.
+
+        ``forward`` False drives against the road's direction.
+        """
         stations = road.knots_m
         xy = road(stations) + road.normal(stations) * offset_m
         self.curve = Curve(xy if forward else xy[::-1])
@@ -115,6 +119,8 @@ def _rounded_corner(a: Float, b: Float, c: Float, radius_m: float) -> Float:
     """Return points (N,2) of the arc that touches the lines a-b and b-c."""
     u = (a - b) / np.linalg.norm(a - b)
     v = (c - b) / np.linalg.norm(c - b)
+    # The centre is on the bisector, r / sin(half angle) from b. The arc touches both lines
+    # r / tan(half angle) from b.
     half = np.arccos(np.clip(u @ v, -1, 1)) / 2  # half the angle between the lines
     centre = b + (u + v) / np.linalg.norm(u + v) * radius_m / np.sin(half)
     begin = b + u * radius_m / np.tan(half)
@@ -136,12 +142,16 @@ class Speed:
         self._acceleration = np.append(np.diff(self._v) / np.diff(self._t), 0.0)
 
     def distance(self, times_s: Float) -> Float:
-        """Return the (N,) metres travelled since the first knot at (N,) seconds, below 0 before."""
+        """Return the metres (N,) travelled at ``times_s`` (N,), relative to the first knot.
+
+        Times before the first knot give negative metres.
+        """
         knot = np.maximum(np.searchsorted(self._t, times_s, side="right") - 1, 0)
         acceleration = np.where(times_s < self._t[0], 0.0, self._acceleration[knot])
-        dt = times_s - self._t[knot]
-        travelled: Float = self._travelled[knot] + self._v[knot] * dt + acceleration * dt**2 / 2
-        return travelled
+        since_s = times_s - self._t[knot]
+        # s = s_knot + v t + a t² / 2
+        travelled_m: Float = self._travelled[knot] + self._v[knot] * since_s
+        return travelled_m + acceleration * since_s**2 / 2
 
 
 @dataclass(frozen=True)
@@ -162,12 +172,12 @@ class Terrain:
         return Terrain(wave, share / np.linalg.norm(wave, axis=1), rng.uniform(0, 2 * np.pi, 3))
 
     def height(self, xy: Float) -> Float:
-        """Return (N,) heights in metres at (N,2) positions."""
+        """Return the heights (N,) in metres at world positions (N,2)."""
         z: Float = np.sin(xy @ self.wave.T + self.phase) @ self.amplitude_m
         return z
 
     def slope(self, xy: Float) -> Float:
-        """Return (N,2) gradients of the height at (N,2) positions."""
+        """Return the gradients (N,2) of the height at world positions (N,2)."""
         gradient: Float = (np.cos(xy @ self.wave.T + self.phase) * self.amplitude_m) @ self.wave
         return gradient
 
@@ -191,7 +201,7 @@ class Poses(NamedTuple):
         return np.einsum("nij,nj->ni", self.rotation, directions)
 
     def rows(self, rows: Int) -> Poses:
-        """Return the poses at these indices."""
+        """Return the poses with the indices ``rows``."""
         return Poses(self.rotation[rows], self.position[rows])
 
     def matrices(self) -> Float:
@@ -217,7 +227,7 @@ class Trajectory(Protocol):
 
 
 def poses_at(trajectory: Trajectory, times_s: Float) -> Poses:
-    """Return N poses at (N,) seconds since frame 0; consecutive equal times are computed once."""
+    """Return N poses at (N,) seconds since frame 0, faster where consecutive times are equal."""
     is_new = np.diff(times_s, prepend=np.nan) != 0
     if is_new.all():
         return trajectory.poses(times_s)
@@ -235,7 +245,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Driving:
-    """A vehicle with both axles on a curve. Its origin is midway between them, x forward, z up."""
+    """A vehicle with both axles on a curve. The origin is midway between them, x forward, z up."""
 
     curve: Curve  # path of both axles
     speed: Speed  # speed along the path
@@ -285,7 +295,7 @@ def on_ground(
 
 
 class Towed:
-    """The trajectory of a trailer, whose axle follows the tractor's kingpin (a tractrix)."""
+    """The trajectory of a trailer whose axle follows the tractor's kingpin (a tractrix)."""
 
     def __init__(self, tractor: Driving, kingpin_m: float, wheelbase_m: float) -> None:
         """Compute the path of the trailer's axle, ``wheelbase_m`` behind the kingpin.
@@ -344,7 +354,7 @@ class Rectangles(NamedTuple):
 
     @staticmethod
     def of(mesh: Mesh, poses: Poses, slack_m: float = 0.0) -> Rectangles:
-        """Return a mesh's footprints at N poses, wider by ``slack_m`` on each side."""
+        """Return the footprints of a mesh at N poses, wider by ``slack_m`` on each side."""
         low, high = mesh.bounds
         n = len(poses.position)
         middle = np.append((low + high)[:2] / 2, 0.0)
@@ -359,12 +369,12 @@ class Rectangles(NamedTuple):
         return Rectangles(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 
     def rows(self, rows: Int | None) -> Rectangles:
-        """Return the rectangles with these indices along the first axis; None adds an axis."""
+        """Return the rectangles with the indices ``rows`` along the first axis, which None adds."""
         return Rectangles(*(column[rows] for column in self))
 
 
 def overlap(a: Rectangles, b: Rectangles) -> Bool:
-    """Return a mask, True for pairs of rectangles that touch; leading shapes are broadcast."""
+    """Return a mask of the pairs of rectangles that touch. Leading shapes are broadcast."""
     # Two rectangles are apart if the direction of a side separates them (separating axes): along
     # it, their centres are farther apart than the sum of their half extents.
     between = b.centre - a.centre
@@ -378,6 +388,6 @@ def overlap(a: Rectangles, b: Rectangles) -> Bool:
 
 
 def _dot(a: Float, b: Float) -> Float:
-    """Return inner products of (...,2) vectors; faster than a sum over two."""
+    """Return the inner products of (...,2) vectors, faster than a sum over two."""
     product: Float = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
     return product

@@ -48,7 +48,7 @@ class Scene:
 
 
 def build(preset: str, rng: np.random.Generator) -> Scene:
-    """Return a random scene; ``preset`` is a key of `PRESETS`, and ``rng`` is advanced."""
+    """Return a random scene. ``preset`` is a key of `PRESETS`, and ``rng`` is advanced."""
     table, lay_roads = PRESETS[preset]
 
     # Roads, ground and static objects
@@ -152,7 +152,7 @@ def _lay_crossing(table: Any, _: object) -> tuple[dict[str, Curve], dict[str, fl
 
 
 def _lay_highway(table: Any, rng: np.random.Generator) -> tuple[dict[str, Curve], dict[str, float]]:
-    """Return a main road whose gentle bends alternate, and the stations."""
+    """Return the main road, whose gentle bends alternate, and the stations, by name."""
     wiggle = table.wiggle
     bend, phase = _vary(rng, wiggle.vary) / wiggle.radius_m, rng.uniform(0, 2 * np.pi)
 
@@ -402,7 +402,7 @@ class Traffic:
     def __init__(
         self, ego: Driving, scenery: Scenery, lanes: Mapping[str, Any], curves: Mapping[str, Curve]
     ) -> None:
-        """Start without actors; ``lanes`` are rows of scenes.yaml and ``curves`` roads, by name."""
+        """Start without actors. ``lanes``, rows of scenes.yaml, and ``curves`` are by name."""
         self.actors: list[Actor] = []
         self._ground, self._rng = scenery.ground, scenery.rng
         self._lanes, self._curves = lanes, curves
@@ -424,7 +424,7 @@ class Traffic:
             self._add(row, station + number * (row.gap_m * _vary(self._rng, _CONVOY_VARIES)))
 
     def _add(self, row: Any, station: float) -> None:
-        """Add an actor near a station, drawn again until it fits."""
+        """Add an actor near a station. Draw until the actor fits, 40 times at most."""
         speed = None  # None: each try draws another
         if hasattr(row, "knots"):
             speed = Speed(*row.knots)

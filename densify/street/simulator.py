@@ -47,7 +47,11 @@ class Bodies:
     def sweep(
         self, frame: int, body: NDArray[np.int32], instance: NDArray[np.int32], points: Float
     ) -> SweepTruth:
-        """Return the truth of a sweep's points, as in `place`, of the objects ``instance`` (N,)."""
+        """Return the ground truth of a sweep's N points.
+
+        Each point has its body (N,), the object ``instance`` (N,), -1 for none, and a position
+        (N,3) in the frame of its body.
+        """
         T_world_lidar = self.T_world_lidar[frame]
         from_lidar = self.place(frame, body, points) - T_world_lidar[:3, 3]
         points_lidar = from_lidar @ T_world_lidar[:3, :3]
@@ -56,10 +60,10 @@ class Bodies:
     def displacement(
         self, frame: int, target: int, body: NDArray[np.int32], points: Float
     ) -> Float:
-        """Return the true flow (N,3), metres, of the points of `place` to the time of ``target``.
+        """Return the true flow (N,3) in metres from a frame to the frame ``target``.
 
-        It is in the lidar frame of ``frame``, ego-motion removed. An unknown target raises
-        InputError.
+        ``body`` (N,) is the body of each point, ``points`` (N,3) are in its frame. The flow is in
+        the lidar frame of ``frame``, ego-motion removed. An unknown target raises InputError.
         """
         self.check(target)
         after = self.place(target, body, points)
@@ -100,7 +104,7 @@ class Simulator:
 
     @property
     def num_frames(self) -> int:
-        """The number of frames."""
+        """The number of frames in the scene's 16 s."""
         return DURATION_S * self.hz
 
     def stamp_ns(self, frame: int) -> int:
@@ -109,11 +113,11 @@ class Simulator:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene."""
+        """The scene of the preset and seed, built at first use."""
         return build_scene(self.preset, self.seed)
 
     def returns(self, frame: int) -> Returns:
-        """Return the returns of the simulated sweep of a frame."""
+        """Simulate the sweep of ``frame``, points in metres, lidar frame at firing time."""
         rng = np.random.default_rng([self.seed, 1, frame])
         time_s = seconds(self.stamp_ns(frame))
         mount = Mount(self.scene.ego, self.sensor, self.period_ns, self.tilt_deg)
@@ -174,7 +178,8 @@ def seconds(time_ns: int) -> float:
 
 
 def _moving(bodies: Sequence[Body], times_s: Float) -> Bool:
-    """Return (F,B) True if the body is part of an object that moves around that time."""
+    """Return the mask (F,B) of bodies that are parts of objects that move around F times."""
+    # Positions at each time, and up to 0.5 s before and after
     times = times_s[:, None] + _MOVING_S * np.array([0, -1, -0.5, 0.5, 1])
     columns = [body.trajectory.poses(times.ravel()).position for body in bodies]
     position = np.stack(columns, axis=1).reshape(*times.shape, len(bodies), 3)

@@ -25,7 +25,7 @@ _FLAT_M2 = 1e-7  # twice the area of a triangle that is left out
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body."""
+    """A rigid body: a mesh that moves along a trajectory."""
 
     mesh: Mesh  # mesh in the frame of the body
     trajectory: Trajectory  # pose of the body over time
@@ -34,19 +34,19 @@ class Body:
 
 
 class Rays(NamedTuple):
-    """N rays."""
+    """N rays in the world, each at its own time."""
 
     origin: Float  # (N,3) metres, world
     direction: Float  # (N,3) unit vectors, world
     time_s: Float  # (N,) seconds since frame 0
 
     def rows(self, rows: Int | slice) -> Rays:
-        """Return the rays at these indices."""
+        """Return the rays with the indices ``rows``."""
         return Rays(*(column[rows] for column in self))
 
 
 class Hits(NamedTuple):
-    """The hits of N rays."""
+    """The first hits of N rays."""
 
     range_m: Float  # (N,) distances, inf without a hit
     triangle: Int  # (N,) index over the triangles of all bodies, -1 without a hit
@@ -56,7 +56,7 @@ class Hits(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """K rays that meet a surface of a body, for which `Optics` decides whether they end there."""
+    """K rays that meet a surface of a body. `Optics` decides whether the rays end there."""
 
     ray: Int  # (K,) ray indices
     triangle: Int  # (K,) triangle indices
@@ -122,7 +122,10 @@ def _embree_scene(corners: Float32) -> Any:
 
 
 class World:
-    """All bodies. Body 0 is static. ``seed`` determines the random properties of surfaces."""
+    """The scene of all bodies, in which `cast` finds where rays hit.
+
+    Body 0 is the static world. ``seed`` determines the random properties of surfaces.
+    """
 
     def __init__(self, bodies: Sequence[Body], seed: int = 0) -> None:
         self.bodies, self.seed = tuple(bodies), seed
@@ -164,14 +167,14 @@ class World:
     def _find_near_rays(
         self, rays: Rays, farthest_m: Float, spread: float
     ) -> Iterator[tuple[int, Int]]:
-        """Yield the index of each moving body that rays may hit, and the indices of these rays."""
-        # These rays meet a ball around the positions of the body at all of their times, before
-        # their static surface. Blocks of consecutive rays are tested before each ray.
-        num = len(rays.time_s)
-        if not num:
+        """Yield each moving body's index with the indices of the rays that may hit the body."""
+        # A ray may hit a body if the ray meets the ball of the body's positions before the static
+        # world. Blocks of consecutive rays are tested first, because most blocks are far away.
+        num_rays = len(rays.time_s)
+        if not num_rays:
             return
-        first = np.arange(0, num, _BLOCK)
-        first_of_ray = np.arange(num) // _BLOCK * _BLOCK
+        first = np.arange(0, num_rays, _BLOCK)
+        first_of_ray = np.arange(num_rays) // _BLOCK * _BLOCK
         # Greatest differences within each block from the origin and direction of its first ray
         block_radius_m, block_spread = (
             np.maximum.reduceat(lengths(column - column[first_of_ray])[:, 0], first)
@@ -182,13 +185,13 @@ class World:
             block_ball = centre, radius_m + block_radius_m, spread + block_spread
             is_near = _meets_ball(blocks, block_farthest_m, *block_ball)
             rows = (first[is_near, None] + np.arange(_BLOCK)).ravel()
-            rows = rows[rows < num]  # the last block may be smaller
+            rows = rows[rows < num_rays]  # the last block may be smaller
             meets = _meets_ball(rays.rows(rows), farthest_m[rows], centre, radius_m, spread)
             if meets.any():
                 yield index, rows[meets]
 
     def _balls(self, times_s: Float) -> Iterator[tuple[Float, float]]:
-        """Yield centre (3,) and radius of a ball around each moving body at all of these times."""
+        """Yield centre (3,) and radius of a ball that holds each moving body at times (N,)."""
         begin_s, end_s = times_s.min(), times_s.max()
         # Both ends are sampled, and steps are shorter than _STEP_S.
         sampled_s = np.linspace(begin_s, end_s, int((end_s - begin_s) / _STEP_S) + 2)
@@ -202,8 +205,9 @@ class World:
     def _cast_at_body(
         self, body: int, origin: Float, direction: Float, number: Int, optics: Optics
     ) -> Hits:
-        """Return the hits of rays with one body, in its frame; ``number`` (N,) has ray indices."""
-        # Distances are to the plane of the triangle, in double precision, also for absorbed rays.
+        """Return the hits of rays with one body, in its frame. ``number`` (N,) are ray indices."""
+        # Embree finds the triangles in single precision. Distances to their planes are computed
+        # in double precision, also for absorbed rays.
         surfaces = self.triangles
         n = len(origin)
         hits = Hits(
@@ -234,7 +238,7 @@ class World:
             hits.absorbed[rows] = outcome == ABSORBED
             hits.normal[rows] = normal
 
-            # Rays that pass go on behind the surface, without a hit so far.
+            # Rays that pass go on a little behind the surface, without a hit so far.
             passing = np.flatnonzero(outcome == PASSES)
             rows, ray = rows[passing], ray[passing]
             passed = surfaces.instance[triangle[passing]]
@@ -247,10 +251,11 @@ class World:
 def _meets_ball(
     rays: Rays, length_m: Float, centre: Float, radius_m: Float | float, spread: Float | float
 ) -> Bool:
-    """Return (N,) True for rays that meet a ball within a length (N,).
+    """Return a mask (N,) of the rays that meet a ball within a length (N,) in metres.
 
     ``spread`` is the greatest angle (rad) by which the true ray deviates from each ray.
     """
+    # The ray passes the centre at a distance d, with d² = |to_centre|² - along².
     to_centre = centre - rays.origin
     along_m = np.einsum("ni,ni->n", to_centre, rays.direction)
     squared_m2 = np.einsum("ni,ni->n", to_centre, to_centre)
