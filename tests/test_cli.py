@@ -21,8 +21,7 @@ import yaml
 
 from densify.cli import recordings
 from densify.cli.commands import parse
-from densify.cli.options import config_of
-from densify.cli.screen import Answer, progress_on_stderr
+from densify.cli.terminal import Answer, config_of, progress_on_stderr
 from densify.config import as_mapping, resolve
 from densify.config.errors import ComputationError, InputError
 from tests.command import exit_code, files_in, refused

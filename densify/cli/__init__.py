@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import NoReturn, TextIO
 
 from densify.cli.commands import answers, parse
-from densify.cli.screen import Screen, screen
+from densify.cli.terminal import Screen, screen
 from densify.config.errors import ComputationError, InputError, is_out_of_memory
 from densify.pipeline.process import keep_freed_memory
 from densify.version import __version__

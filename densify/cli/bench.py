@@ -16,8 +16,17 @@ from densify.bench.doctor import bench_doctor
 from densify.bench.flow import DEFAULT_METHODS, bench_flow, tables
 from densify.bench.training import mean_and_error
 from densify.bench.verdicts import verdicts
-from densify.cli.options import config_of, recording_of, recordings_of
-from densify.cli.screen import Answer, aligned, numbers_table, percent, progress_on_stderr, written
+from densify.cli.terminal import (
+    Answer,
+    aligned,
+    config_of,
+    numbers_table,
+    percent,
+    progress_on_stderr,
+    recording_of,
+    recordings_of,
+    written,
+)
 from densify.config import as_mapping, resolve
 from densify.config.cache import Cache
 from densify.config.errors import InputError

@@ -14,15 +14,19 @@ from typing import Any
 import numpy as np
 import yaml
 
-from densify.cli.options import (
+from densify.cli.terminal import (
+    Answer,
     check_new_file,
     config_of,
+    first_of,
+    log_warnings,
+    percent,
+    progress_on_stderr,
     raise_failures,
     recording_of,
     recordings_of,
     selected_frames,
 )
-from densify.cli.screen import Answer, first_of, log_warnings, percent, progress_on_stderr
 from densify.config import Config, apply_overrides, find_changes, resolve
 from densify.config.errors import ComputationError, InputError
 from densify.dataset.make import Summary, damaged, make_dataset, status

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer ``densify run`` and ``compare``, and the verbs of finished runs and of depth maps."""
+"""Answer ``densify run`` and ``compare``."""
 
 from __future__ import annotations
 
@@ -11,32 +11,30 @@ from typing import Any
 
 import numpy as np
 
-from densify.bench.depth import evaluate
-from densify.cli.options import config_of, raise_failures, recording_of, selected_frames
-from densify.cli.screen import (
+from densify.cli.terminal import (
     Answer,
     aligned,
+    config_of,
     first_of,
     log_warnings,
     look_up,
-    numbers_table,
     percent,
     progress_on_stderr,
+    raise_failures,
+    recording_of,
+    selected_frames,
     written,
 )
 from densify.config import as_mapping
 from densify.config.errors import ComputationError, InputError
-from densify.dataset.report import write_comparison_page, write_report
 from densify.geometry.types import METHOD_NAMES, LidarSequence, Result
-from densify.outputs.finished_run import Thresholds, export_run, facts, finished_runs
 from densify.outputs.folders import check_recording, default_folder, plain
 from densify.outputs.key_outputs import check_writable, write_comparison, write_result
 from densify.outputs.plots import order_front_first
-from densify.outputs.viewers import show_in_open3d, show_in_rerun
+from densify.outputs.report_page import write_key_page
 from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import USUAL
 from densify.readers import Spec, open_sequence
-from densify.readers.depth_trees import pair_depth_files
 from densify.readers.timeline import format_frames
 from densify.scores.metrics import LEAST_PIXELS
 
@@ -61,12 +59,6 @@ _SCORES = (
     ("RMSE", "rmse_m", ".3f m"),
     ("outliers", "outliers", ".2%"),
 )
-_UNPAIRED = {
-    "without_truth": "predicted without truth",
-    "without_prediction": "truth without prediction",
-    "without_mask": "truth without mask",
-}
-_MOST_NAMED = 5
 _PRODUCTS = ("measured", "filled")
 
 
@@ -145,7 +137,7 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
         results, out, config=as_mapping(config), data=spec, overwrite=options.overwrite
     )
     if config.output.report:
-        paths.append(write_comparison_page(paths[0].parent))
+        paths.append(write_key_page(paths[0].parent, "compare.json"))
     scores = {"key": options.key, "methods": {n: _key_facts(r) for n, r in results.items()}}
     yield Answer(_comparison(results), scores, paths, first_of(paths, _FIRST_OF_COMPARISON))
     distinct = dict.fromkeys(w for result in results.values() for w in result.warnings)
@@ -248,61 +240,3 @@ def _comparison(results: Mapping[str, Result]) -> str:
         if any(number is not None for number in numbers):
             lines.append([title, *(written(number, form) for number in numbers)])
     return aligned(lines)
-
-
-def answer_export(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify export``: write a run in another format, and yield what the limits keep."""
-    exported = export_run(
-        options.run,
-        options.to,
-        options.out,
-        min_confidence=options.min_confidence,
-        max_age_ms=options.max_age_ms,
-        cameras=options.camera,
-        overwrite=options.overwrite,
-    )
-    lines = []
-    for camera, products in exported.density.items():
-        measured, filled = (
-            f"{percent(products[p].before, digits=1)} -> {percent(products[p].after, digits=1)}"
-            for p in _PRODUCTS
-        )
-        lines.append(f"{camera}: depth in {measured} of the pixels, {filled} with filled ones")
-    points = exported.num_points
-    if points is not None:
-        lines.append(f"cloud: {points.after:,} of {points.before:,} points")
-    yield Answer("\n".join(lines), facts(exported), exported.paths)
-
-
-def answer_report(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify report``: write the HTML pages of a folder."""
-    yield Answer(files=write_report(options.dir, options.overwrite))
-
-
-def answer_view(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify view``: show finished runs until the user closes the viewer."""
-    runs = finished_runs(options.dir, Thresholds(cameras=options.camera))
-    viewers = {"rerun": show_in_rerun, "open3d": show_in_open3d}
-    viewers[vars(options)["with"]](runs)
-    keys = [run.key for run in runs]
-    yield Answer(f"shown: key {', '.join(map(str, keys))}", {"keys": keys})
-
-
-def answer_evaluate(options: argparse.Namespace) -> Iterator[Answer]:
-    """Answer ``densify evaluate``: yield the scores of depth maps against ground truth."""
-    pairs = pair_depth_files(options.predicted, options.truth, options.mask, filled=options.filled)
-    with progress_on_stderr() as progress:
-        scores = evaluate(pairs, options.focal_px, options.baseline_m, progress)
-    num_images, density = scores["num_images"], scores["density"]
-    lines = [
-        f"{num_images:,} image{'s' * (num_images != 1)}: predicted "
-        f"{percent(density['predicted'])} of the pixels, truth {percent(density['truth'])}; "
-        f"outliers with fx {scores['focal_px']:g} px, baseline {scores['baseline_m']:g} m"
-    ]
-    for name, title in _UNPAIRED.items():
-        if paths := scores[name]:
-            num_more = len(paths) - _MOST_NAMED
-            more = f", ... and {num_more:,} more" if num_more > 0 else ""
-            lines.append(f"{title}: {len(paths):,}: {', '.join(paths[:_MOST_NAMED])}{more}")
-    columns = {part: errors for part, errors in scores["parts"].items() if errors["num_pixels"]}
-    yield Answer("\n".join([*lines, numbers_table(columns)]), {"scores": scores})

@@ -36,7 +36,7 @@ from densify.geometry.types import METHOD_NAMES, Float32, LidarSequence
 from densify.outputs.depth_png import Picture, encode_jpeg, metres, read_stored
 from densify.outputs.folders import write_file
 from densify.outputs.plots import Dot, depth_over_image, order_front_first, score_plot
-from densify.outputs.report_page import KeyFiles, fill_template, key_page
+from densify.outputs.report_page import PAGES, fill_template, write_key_page
 from densify.readers import open_sequence
 
 FILLED = ("depth_filled", "groundtruth_filled")
@@ -44,7 +44,6 @@ FILLED = ("depth_filled", "groundtruth_filled")
 _ASIDE = "aside"  # folder of the pictures of keys that are put aside, in a training set
 _WIDTH_PX = 400
 _QUALITY = 80
-_PAGES = {"run.yaml": "report.html", "compare.json": "compare.html"}  # of a key, by its record
 _NUM_WORST, _NUM_SPREAD = 6, 18  # keys with pictures: the worst, and others spread over the set
 _NUM_ASIDE = 12  # keys with pictures among those put aside
 _NUM_LISTED = 1000  # rows of the table of keys, the worst first
@@ -437,19 +436,6 @@ def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> Path:
 # Files
 
 
-def write_comparison_page(folder: Path) -> Path:
-    """Write ``compare.html`` of the comparison in a key sweep's folder, and return its path."""
-    return _write_key_page(folder, "compare.json")
-
-
-def _write_key_page(folder: Path, source: str) -> Path:
-    """Write the page of a key sweep from the file that records its run or comparison."""
-    is_run, page = source == "run.yaml", folder / _PAGES[source]
-    files = KeyFiles.of_run(folder) if is_run else KeyFiles.of_comparison(folder)
-    write_file(page, key_page(files, str(folder) if is_run else ""))
-    return page
-
-
 def write_set_page(root: Path, command: str = "") -> Path:
     """Write ``report.html`` of a training set, and return its path.
 
@@ -469,10 +455,10 @@ def write_report(folder: Path, overwrite: bool = False) -> list[Path]:
     if (folder / "dataset.json").is_file():
         return [write_set_page(folder)]
     folder, sources = _key_in(folder)
-    for path in (folder / _PAGES[source] for source in sources):
+    for path in (folder / PAGES[source] for source in sources):
         if path.exists() and not overwrite:
             raise InputError(f"{path}: already there and kept; give --overwrite to replace it")
-    return [_write_key_page(folder, source) for source in sources]
+    return [write_key_page(folder, source) for source in sources]
 
 
 def _key_in(folder: Path) -> tuple[Path, list[str]]:
@@ -482,7 +468,7 @@ def _key_in(folder: Path) -> tuple[Path, list[str]]:
             f"{folder}: no such folder; expected what densify run, compare or dataset wrote"
         )
     sources_in = {
-        path: [source for source in _PAGES if (path / source).is_file()]
+        path: [source for source in PAGES if (path / source).is_file()]
         for path in (folder, *sorted(folder.iterdir()))
     }
     keys = [path for path, sources in sources_in.items() if sources]

@@ -27,12 +27,14 @@ from densify.geometry.types import Bool, Float, Int, ObjectTrack
 from densify.outputs.cloud_files import StoredCloud, read_cloud
 from densify.outputs.depth_png import PixelType, read_stored
 from densify.outputs.finished_run import map_names, read_scene, read_tracks
-from densify.outputs.folders import mapping_or_empty, plain
+from densify.outputs.folders import mapping_or_empty, plain, write_file
 from densify.outputs.plots import order_front_first
 from densify.readers.decoded_files import decode_image
 from densify.version import __version__
 
 T = TypeVar("T")
+PAGES = {"run.yaml": "report.html", "compare.json": "compare.html"}
+"""File that records a run or a comparison of a key -> file of its page."""
 _MAPS: Mapping[str, PixelType] = {
     "depth": np.uint16,
     "depth_filled": np.uint16,
@@ -370,3 +372,11 @@ def _palettes() -> dict[str, str]:
         bgr = cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{name.upper()}"))
         palettes[name] = base64.b64encode(bgr.reshape(256, 3)[:, ::-1].tobytes()).decode()
     return palettes
+
+
+def write_key_page(folder: Path, source: str) -> Path:
+    """Write the page of a key sweep from the file that records its run or comparison."""
+    is_run, page = source == "run.yaml", folder / PAGES[source]
+    files = KeyFiles.of_run(folder) if is_run else KeyFiles.of_comparison(folder)
+    write_file(page, key_page(files, str(folder) if is_run else ""))
+    return page
