@@ -16,8 +16,13 @@ from plyfile import PlyData
 import densify
 from densify.config.plugins import EXPORTS
 from densify.outputs.cloud_files import read_cloud
-from densify.outputs.depth_png import read_depth_png, stored_age, stored_confidence
-from densify.outputs.finished_run import export_run
+from densify.outputs.depth_png import (
+    read_depth_png,
+    stored_age,
+    stored_confidence,
+    write_depth_png,
+)
+from densify.outputs.finished_run import FinishedRun, Thresholds, export_run
 from densify.readers.depth_trees import pair_depth_files
 from tests.command import exit_code
 from tests.command import refused as refused_command
@@ -135,6 +140,18 @@ def test_thresholds_leave_exactly_these_pixels(run: Path, confidence: float, age
         certain = np.maximum(stored(run, "confidence", camera).astype(np.float32) - 1, 0) * keep
         left = np.load(run / "export" / "npy" / "confidence" / f"{camera}.npy")
         np.testing.assert_array_equal(left, certain / np.float32(254))
+
+
+def test_a_prior_does_not_bring_back_what_a_threshold_leaves_out(run: Path) -> None:
+    whole_m = read_depth_png(run / "depth_filled" / "image_02.png")
+    (run / "depth_full").mkdir()
+    completed_m = np.where(whole_m > 0, whole_m, np.float32(7))
+    write_depth_png(run / "depth_full" / "image_02.png", completed_m)
+    keep = stored(run, "confidence", "image_02") >= stored_confidence(0.5)
+    expected_m = np.where(whole_m > 0, np.where(keep, whole_m, 0), 7)
+    full_m = FinishedRun(run, Thresholds(min_confidence=0.5)).full_m("image_02")
+    np.testing.assert_array_equal(full_m, expected_m)
+    assert (full_m == 0).any() and (full_m == 7).any()
 
 
 def test_kitti_is_what_readers_of_the_benchmark_expect(tmp_path: Path) -> None:

@@ -135,8 +135,8 @@ def beyond_luck(
     """Return the changes, by name, of figures that worsened by more than ``sigmas`` deviations.
 
     Args:
-        before: Name of the figure -> value of a key in the first measurement.
-        now: Name of the figure -> value in the second measurement.
+        before: Name of the figure -> its value at one key sweep, in the first measurement.
+        now: The same in the second measurement. A change is now minus before.
         luck: Name of a `change` -> its standard deviation by luck.
         sigmas: Limit, in standard deviations of the difference of two measurements.
     """

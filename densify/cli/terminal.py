@@ -197,7 +197,13 @@ def selected_frames(sequence: LidarSequence, keys: range | None) -> list[int]:
 
 
 def raise_failures(failures: Mapping[int, Exception], num: int, unit: str) -> None:
-    """Raise ComputationError, with reasons by frame, if any of ``num`` keys or sweeps failed."""
+    """Raise ComputationError if any key or sweep failed.
+
+    Args:
+        failures: Frame number -> error of those that failed.
+        num: Number of those that were tried.
+        unit: "key" or "sweep", for the message.
+    """
     if failures:
         reasons = "; ".join(f"{unit} {number}: {error}" for number, error in failures.items())
         raise ComputationError(f"{len(failures)} of {num} {unit}s not made: {reasons}")

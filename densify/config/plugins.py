@@ -50,7 +50,7 @@ class Plugin:
 
 @dataclass(frozen=True)
 class Table:
-    """The plug-ins of one kind."""
+    """All plug-ins of one kind, built-in or from entry points, which are looked up by name."""
 
     kind: str  # name of the kind, for messages
     group: str  # entry-point group through which packages add plug-ins

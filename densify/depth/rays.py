@@ -309,7 +309,10 @@ def _lower_to_ground(track: ObjectTrack, rays: Rays, ground: HeightMap) -> Objec
 
 
 def corners_of(size_m: Float) -> Float:
-    """Return the corners (8,3), bottom and top in turn, of a box of (3,) m around the origin."""
+    """Return the (8,3) corners in metres of a box of lengths ``size_m`` (3,) around the origin.
+
+    Even rows are corners at the bottom, odd rows those above them.
+    """
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), axis=-1)
     return signs.reshape(-1, 3) * size_m / 2
 

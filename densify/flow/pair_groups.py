@@ -194,7 +194,10 @@ class Proposal:
 
     @property
     def gain(self) -> float:
-        """The log-likelihood ratio of both clouds, without target points that fit static better."""
+        """The log-likelihood ratio of moved against static, summed over the points of both clouds.
+
+        Target points that fit a static object better count as 0.
+        """
         # Target points on parts that the object showed only later would bias the motion.
         return self.source_gain + float(np.maximum(self.target_gain, 0.0).sum())
 

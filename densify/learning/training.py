@@ -76,7 +76,17 @@ class Training:
 
 
 def train(training: Training, out: Path, progress: Progress | None = None) -> float:
-    """Train a network, write the model to ``out``, and return the mean of its last 50 losses."""
+    """Train a network, write its model file, and return the mean of its last 50 losses.
+
+    Args:
+        training: Recordings, teacher, number of steps, seed and device.
+        out: Path of the model file.
+        progress: Callback (stage, done, total).
+
+    Raises:
+        InputError: The number of steps, the device or a recording cannot be used.
+        ComputationError: The loss is not finite.
+    """
     loss_of, device = TEACHERS[training.teacher], find_device(training.device)
     if training.steps < 1:
         raise InputError(f"--steps {training.steps}: expected 1 or more")

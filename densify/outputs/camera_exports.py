@@ -75,12 +75,14 @@ def write_colmap(runs: Sequence[FinishedRun], folder: Path) -> None:
 def write_splats(runs: Sequence[FinishedRun], folder: Path) -> None:
     """Write the input of 3-D Gaussian splatting (Kerbl et al., SIGGRAPH 2023).
 
-    The static world is a COLMAP model. Depth maps are for ``-d depths``: inverse depth is ``value /
-    65536 * scale + offset``, by ``sparse/0/depth_params.json``. As an empty pixel counts as
-    infinitely far, images are transparent, and not trained, where depth is unknown.
-    ``movers/0003.ply`` has the points of object 3 in its own frame. ``movers/others.ply`` has
-    moving points without a track in the key sweep's lidar frame. With several runs, both are in
-    ``movers/000120/``. ``tracks.json`` is each run's ``movers.json``.
+    - ``sparse/0``: the static world as a COLMAP model.
+    - ``depths``: inverse depth is ``value / 65536 * scale + offset``, with the scale and offset of
+      ``sparse/0/depth_params.json``. The trainer reads it with its option ``-d depths``.
+    - ``images``: transparent where the depth is unknown. The trainer would take an empty pixel
+      as infinitely far, and leaves transparent pixels out.
+    - ``movers/0003.ply``: the points of object 3 in its own frame. ``movers/others.ply``: moving
+      points without a track in the key sweep's lidar frame. With several runs, the folder is
+      ``movers/000120``, by the key. ``tracks.json`` there is the run's ``movers.json``.
     """
     pictures = _pictures(runs, flat=True)
     cloud = _world_cloud(runs)

@@ -237,12 +237,17 @@ class FinishedRun:
         return {kind: stored * keep for kind, stored in maps.items()}
 
     def full_m(self, name: str) -> Float32:
-        """Return filled depth (H,W) in metres, completed with the prior if any, 0 for none."""
+        """Return filled depth (H,W) in metres, completed with the prior if any, 0 for none.
+
+        The thresholds leave out filled depth, and keep depth from the prior.
+        """
         stored = self.maps(name)["depth_filled"]
         path = map_path(self.folder, "depth_full", name)
         if path.is_file():
             full = read_stored(path, np.uint16, "a map of depth_full")
-            stored = np.where(stored > 0, stored, full)
+            filled_path = map_path(self.folder, "depth_filled", name)
+            filled = read_stored(filled_path, np.uint16, "a map of depth_filled")
+            stored = np.where(filled > 0, stored, full)
         return metres(stored)
 
     def cloud(self) -> StoredCloud:

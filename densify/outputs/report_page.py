@@ -72,7 +72,13 @@ class KeyFiles:
 
     @staticmethod
     def of_run(folder: Path) -> KeyFiles:
-        """Return the files of a run. Raise InputError without a readable run.yaml."""
+        """Return the files of one key's run in ``folder``, its own method as the last method.
+
+        Other files that cannot be read are noted in ``missing``.
+
+        Raises:
+            InputError: There is no readable run.yaml.
+        """
         files = KeyFiles(folder, mapping_or_empty(read_yaml(folder / "run.yaml")[0]), {})
         metrics = mapping_or_empty(files.read(read_json, "metrics.json"))
         method = str(files.about.get("method", "run"))

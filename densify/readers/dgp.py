@@ -32,7 +32,15 @@ _BOGUS_YEAR = 2200  # DDAD stores tenths of microseconds as microseconds
 
 
 def open_recording(path: Path, scene: str | None) -> Dgp:
-    """Return the scene in a folder, or the scene of this name in a folder of scenes."""
+    """Open a scene in Toyota's Dataset Governance Policy format.
+
+    Args:
+        path: Folder of the scene, or of several scenes.
+        scene: Name of one of several scenes; None for the scene in ``path``, or its only one.
+
+    Raises:
+        InputError: The folder has no scene, several and no name is given, or none of this name.
+    """
     if scene is None and _scene_files(path):
         return Dgp(path)
     names = sorted(folder.name for folder in path.glob("*/") if _scene_files(folder))

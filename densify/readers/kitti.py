@@ -146,8 +146,9 @@ class Drive(FileSequence):
 class KittiRaw(Drive):
     """A KITTI raw drive as a `LidarSequence`, stamped at the middle of the revolution.
 
-    Without ``timestamps.txt`` a stamp is the mean of start and end; without these ``offset_ns`` is
-    None. The world is the frame of the GPS/IMU unit at the first oxts file.
+    Without ``timestamps.txt``, a stamp is the mean of ``timestamps_start.txt`` and
+    ``timestamps_end.txt``. Without these two files, the points have no times (``offset_ns`` None).
+    The world is the frame of the GPS/IMU unit at the first oxts file.
     """
 
     def __init__(self, path: Path | str) -> None:

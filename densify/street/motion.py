@@ -163,9 +163,15 @@ class Terrain:
     phase: Float  # (W,) phases in rad
 
     @staticmethod
-    def hilly(rng: np.random.Generator, max_slope: float, scale_m: float = 1.0) -> Terrain:
-        """Return a terrain of three random waves, nowhere steeper than ``max_slope``."""
-        length_m = _WAVE_M * scale_m
+    def hilly(rng: np.random.Generator, max_slope: float, scale: float = 1.0) -> Terrain:
+        """Return a terrain of three random waves.
+
+        Args:
+            rng: Draws the directions and phases of the waves.
+            max_slope: Greatest slope of the terrain, rise over run.
+            scale: Factor of the usual wavelengths, 95 to 240 m.
+        """
+        length_m = _WAVE_M * scale
         angle = rng.uniform(0, 2 * np.pi, 3)
         wave = (2 * np.pi / length_m)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
         share = max_slope * _WAVE_SHARE
@@ -369,7 +375,7 @@ class Rectangles(NamedTuple):
         return Rectangles(*(np.concatenate(columns) for columns in zip(*groups, strict=True)))
 
     def rows(self, rows: Int | None) -> Rectangles:
-        """Return the rectangles with the indices ``rows`` along the first axis, which None adds."""
+        """Return the rectangles with the indices ``rows``; None adds a first axis of length 1."""
         return Rectangles(*(column[rows] for column in self))
 
 

@@ -44,11 +44,11 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Softened:
-    """How an object bends from sweep to sweep; its points in one sweep are a `Snapshot`."""
+    """The non-rigid motion of one object between the sweeps that see it."""
 
     snapshots: tuple[Snapshot, ...]  # points of the object in each sweep, by ascending time
-    # Hop (a, b), from a snapshot to the next or previous one: (n,3) metres, displacement of the
-    # points of a to the time of b relative to the rigid motion, object's frame; empty for rigid
+    # hops[a, b] is (n,3) in metres: the displacement of the points of snapshot a to the time of its
+    # neighbour b, relative to the rigid motion, in the object's frame. Empty for a rigid object.
     hops: dict[tuple[int, int], Float]
     # Weight of smoothness (stiffness) that held-out snapshots confirmed, inf for rigid
     alpha: float
