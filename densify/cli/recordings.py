@@ -117,7 +117,7 @@ def answer_simulate(options: argparse.Namespace) -> Iterator[Answer]:
     wanted = (options.format, street, options.out, frames, options.camera)
     with progress_on_stderr() as progress:
         folder = write_street(*wanted, progress, overwrite=options.overwrite)
-    text = f"{len(frames)} frames; open them with --data {folder}"
+    text = f"{len(frames)} frames; open them: densify run {folder}"
     yield Answer(text, {"data": str(folder), "num_frames": len(frames)})
 
 

@@ -150,12 +150,12 @@ def manifest(folder: str | Path) -> Any:
 
 
 def describe_pace(records: Iterable[KeyRecord]) -> str:
-    """Return the mean and the range of the computing times of all tried keys as text."""
+    """Return the median and the range of the computing times of all tried keys as text."""
     seconds = [record.seconds for record in records]
     if not seconds:
         return ""
     span = f" ({min(seconds):.1f} to {max(seconds):.1f})" if len(seconds) > 1 else ""
-    return f"{np.mean(seconds):.1f} s a key{span}"
+    return f"{np.median(seconds):.1f} s a key{span}"
 
 
 def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -79,9 +80,22 @@ class _Score(NamedTuple):
         values = record.values_of(self.name)
         return 100 * (max(values) if self.is_bad > 0 else min(values)) if values else None
 
+    def camera_of(self, record: KeyRecord) -> str | None:
+        """Return the name of the worst camera of a key, None if the score has no cameras."""
+        values = record.scores.get(self.name)
+        if not isinstance(values, Mapping):
+            return None
+        known = {name: value for name, value in values.items() if value is not None}
+        return max(known, key=lambda name: self.is_bad * known[name], default=None)
+
     def usual(self) -> list[float]:
         """Return the ends of the range on KITTI in ``unit``, [] if unknown."""
         return [100 * share for share in USUAL_SHARES.get(self.name, ())]
+
+    def is_worse_than_usual(self, value: float) -> bool:
+        """Return True if a value in ``unit`` lies beyond the bad end of the range on KITTI."""
+        usual = self.usual()
+        return bool(usual) and self.is_bad * value > max(self.is_bad * end for end in usual)
 
 
 _SCORES = (
@@ -122,14 +136,17 @@ def _read_set(root: Path) -> _Set:
     drives = drives_of(table)
     records = [record for record in read_manifests(root).values() if record.drive in drives]
     done = [record for record in records if record.status == "done"]
-    ranks = {record.name: (0.0, "") for record in done}
-    for score in _SCORES:
-        values = [(record.name, score.of(record)) for record in done]
-        known = sorted((score.is_bad * value, name) for name, value in values if value is not None)
-        for rank, (_, name) in enumerate(known if score.is_bad else [], start=1):
-            ranks[name] = max(ranks[name], (rank / len(known), score.name))
-    worst_first = sorted(done, key=lambda record: ranks[record.name][0], reverse=True)
-    worst_score = {name: score for name, (_, score) in ranks.items()}
+    # A key is as bad as its worst score. Scores compare by their distance from the median of the
+    # set, in widths of the range that is usual on KITTI.
+    badness = {record.name: (-math.inf, "") for record in done}
+    for score in (score for score in _SCORES if score.usual()):
+        low, high = score.usual()
+        values = {r.name: value for r in done if (value := score.of(r)) is not None}
+        for name, value in values.items():
+            distance = score.is_bad * (value - float(np.median([*values.values()])))
+            badness[name] = max(badness[name], (distance / (high - low), score.name))
+    worst_first = sorted(done, key=lambda record: badness[record.name][0], reverse=True)
+    worst_score = {name: score for name, (_, score) in badness.items()}
     scores = [score for score in _SCORES if any(score.of(r) is not None for r in records)]
     return _Set(root, table, drives, records, worst_first, worst_score, scores)
 
@@ -197,19 +214,26 @@ def _state(made: _Set, command: str) -> str:
 
 
 def _verdict(made: _Set) -> str:
-    """Return a sentence that says whether the set is as good as one of KITTI."""
+    """Return sentences that say whether the set is as good as one of KITTI."""
     if not made.worst_first:
         return "No key is done."
-    compared, worse = [], []
-    for score in _SCORES:
-        if (values := made.values(score)) and (usual := score.usual()):
-            compared.append(score.title.lower())
-            bound = max(score.is_bad * end for end in usual)
-            if score.is_bad * float(np.median(values)) > bound:
-                worse.append(score.title.lower())
-    lines = [f"As usual on KITTI drive 0013 (64 rings, window 5): {', '.join(compared)}."]
+    judged = [score for score in _SCORES if score.usual() and made.values(score)]
+    medians = {score.title.lower(): float(np.median(made.values(score))) for score in judged}
+    worse = [s.title.lower() for s in judged if s.is_worse_than_usual(medians[s.title.lower()])]
+    scanner = "KITTI drive 0013 (64 rings, front camera, moving vehicle)"
+    lines = [f"Good: {', '.join(medians)} are as usual on {scanner}."]
     if worse:
-        lines = [f"Worse than usual on KITTI drive 0013: {', '.join(worse)}. See the worst keys."]
+        lines = [f"Worse than usual on {scanner}: {', '.join(worse)}. See the worst keys."]
+    if "held-out outliers" not in medians:
+        lines.append("Outliers are not measured: --set output.score=true does.")
+    num_beyond = sum(
+        any((v := s.of(record)) is not None and s.is_worse_than_usual(v) for s in judged)
+        for record in made.worst_first
+    )
+    if num_beyond:
+        lines.append(
+            f"{num_beyond:,} of {len(made.worst_first):,} keys are worse than usual there."
+        )
     num_out = len(made.records) - len(made.worst_first)
     if num_out > _MANY_ASIDE * len(made.records):
         lines.append(f"{num_out:,} of {len(made.records):,} keys were put aside or failed.")
@@ -223,7 +247,8 @@ def _score_row(made: _Set, score: _Score) -> list[str]:
     if score.limit and gate[score.limit] is not None:
         limits.append(f"{score.limit[:3]}. {_text(100.0 * gate[score.limit])} {unit}")
     if score.limit in ("max_ghost", "max_outliers") and gate["max_ratio"] is not None:
-        limits.append(f"usual, {gate['max_ratio']:g} × the neighbours' median")
+        floor = f"{score.usual()[1]:g} {unit}"
+        limits.append(f"{floor} and {gate['max_ratio']:g} × its neighbours' median")
     median, span = "not computed", ""
     if values:
         low, middle, high = map(float, np.quantile(values, (0.05, 0.5, 0.95)))
@@ -263,7 +288,10 @@ def _plot(score: _Score, made: _Set) -> str:
         if (record.status == "aside" or record.name in shown)
         if (value := score.of(record)) is not None
     ]
-    return score_plot(score.title, score.unit, dots, score.usual())
+    usual = score.usual()
+    if usual and score.is_bad > 0:
+        usual[0] = 0.0  # a lower value is no worse
+    return score_plot(score.title, score.unit, dots, usual)
 
 
 def _anchor(kind: str, record: KeyRecord) -> str:
@@ -278,7 +306,8 @@ def _card(made: _Set, record: KeyRecord) -> str:
             pictures += picture
     except (InputError, OSError) as error:
         pictures += f"<p>{html.escape(str(error))}</p>"
-    for score in made.scores:
+    worst = made.worst_score.get(record.name)
+    for score in sorted(made.scores, key=lambda score: score.name != worst):  # the worst one first
         if (value := score.of(record)) is not None:
             text = f"{score.title.lower()} {_text(value)} {score.unit}".replace(" ", "&nbsp;")
             texts.append(made.marked(record, score, text))
@@ -292,18 +321,22 @@ def _card(made: _Set, record: KeyRecord) -> str:
 
 
 def _pictures(made: _Set, record: KeyRecord, name: str) -> Iterator[str]:
-    """Yield the image, the filled depth and the confidence of a key as HTML, if it has them."""
+    """Yield the image, the filled depth and the confidence of a key as HTML, if it has them.
+
+    The camera is that of the key's worst score, or the front camera.
+    """
     drive = made.drives[record.drive]
-    camera = front_camera(drive)
+    worst = {score.name: score for score in _SCORES}.get(made.worst_score.get(record.name, ""))
+    camera = (worst and worst.camera_of(record)) or front_camera(drive)
     depth = find_map(record, FILLED, camera)
     confidence = find_map(record, ("confidence",), camera)
     kept = next((n for n in record.files if n.startswith(f"{_ASIDE}/")), None)
     if depth is not None:
         small_m = metres(_shrink(read_stored(made.root / depth, np.uint16, "a depth map")))
-        image = _small_image(drive, record.key, small_m.shape[::-1])
+        image = _small_image(drive, camera, record.key, small_m.shape[::-1])
         if image is not None:
             yield _image(image, f"image {camera}, {name}")
-        yield _image(_draw_depth(small_m, image), f"filled depth, {name}")
+        yield _image(_draw_depth(small_m, image), f"filled depth {camera}, {name}")
     elif kept is not None:
         yield _embedded((made.root / kept).read_bytes(), f"filled depth, {name}")
     if confidence is not None:
@@ -391,9 +424,9 @@ def _shrink(values: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(values[::step, ::step])
 
 
-def _small_image(drive: Drive, key: int, size_px: tuple[int, int]) -> Picture | None:
-    """Return the RGB image at a key sweep, resized to (width, height); None if there is none."""
-    camera = drive.cameras[front_camera(drive)]
+def _small_image(drive: Drive, name: str, key: int, size_px: tuple[int, int]) -> Picture | None:
+    """Return a camera's RGB image at a key sweep, resized to (width, height); None for none."""
+    camera = drive.cameras[name]
     try:
         sequence = _open(drive.data)
         number = key_shots(sequence, [camera], key)[camera.name].number
@@ -427,7 +460,8 @@ def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> Path:
         filled_m: (H,W) filled depth of the `front_camera` in metres, 0 for no depth.
     """
     small_m = _shrink(filled_m)
-    picture = _draw_depth(small_m, _small_image(drive, key, small_m.shape[::-1]))
+    image = _small_image(drive, front_camera(drive), key, small_m.shape[::-1])
+    picture = _draw_depth(small_m, image)
     path = out / _ASIDE / drive.name / f"{key:010d}.jpg"
     write_file(path, encode_jpeg(picture, _QUALITY))
     return path
