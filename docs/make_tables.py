@@ -133,17 +133,28 @@ def of_gate(stored: gate.Stored, keys: Sequence[str], figure: str) -> str:
 
 def training(networks: Any) -> str:
     """Return the table of outliers of networks that were trained on all real recordings."""
-    rows = [[kind, *training_cells(tests)] for kind, tests in networks["both"].items()]
+    of_kinds = networks["both"]
+    rows = [[kind, *cells] for kind, cells in zip(of_kinds, best_in_bold(of_kinds), strict=True)]
     return table(["trained on", *training_titles(networks)], rows)
+
+
+def trained(networks: Any) -> str:
+    """Return the table of the README: networks of all real recordings on the two real tests."""
+    kinds = ("rigid (ICP)", "rigid cleaned", "densify measured", "densify filled")
+    real = [test for test in next(iter(networks["both"].values())) if "street" not in test]
+    of_kinds = {k: {t: networks["both"][k][t] for t in real} for k in kinds}
+    rows = [[kind, *cells] for kind, cells in zip(of_kinds, best_in_bold(of_kinds), strict=True)]
+    titles = training_titles({"both": of_kinds})
+    return table(["outliers in %, trained on", *titles], rows)
 
 
 def other_training(networks: Any) -> str:
     """Return the table of outliers of networks that were trained on other recordings."""
     rows = [
-        [name, kind, *training_cells(tests)]
+        [name, kind, *cells]
         for name, kinds in networks.items()
         if name != "both"
-        for kind, tests in kinds.items()
+        for kind, cells in zip(kinds, best_in_bold(kinds), strict=True)
     ]
     return table(["recordings", "trained on", *training_titles(networks)], rows)
 
@@ -154,10 +165,24 @@ def training_titles(networks: Any) -> list[str]:
     return [f"{test.split(',')[0]}, {part}" for test, parts in tests.items() for part in parts]
 
 
-def training_cells(tests: Any) -> list[str]:
-    """Return outliers in % with their standard error, for each test and part of the pixels."""
-    means_and_errors = [both for parts in tests.values() for both in parts.values()]
-    return [f"{mean:.2f} ± {error:.2f}" for mean, error in means_and_errors]
+def best_in_bold(kinds: Any) -> list[list[str]]:
+    """Return outliers in % with their standard error, for each kind of maps, test and part.
+
+    The least of a test and part is in bold, with those within two standard errors of it.
+    """
+    figures = [
+        [both for parts in tests.values() for both in parts.values()] for tests in kinds.values()
+    ]
+    best = [min(column) for column in zip(*figures, strict=True)]
+    return [
+        [
+            f"**{mean:.2f}** ± {error:.2f}"
+            if mean - least <= 2 * math.hypot(error, least_error)
+            else f"{mean:.2f} ± {error:.2f}"
+            for (mean, error), (least, least_error) in zip(row, best, strict=True)
+        ]
+        for row in figures
+    ]
 
 
 def training_figures(networks: Any) -> Any:
@@ -258,7 +283,7 @@ def with_tables(page: str) -> str:
     numbers, stored = json.loads(NUMBERS.read_text()), gate.read(ROOT / "tests/gate.json")
     makers = {f.__name__: f for f in (headline, comparison, judged, baselines)}
 
-    of_training = {f.__name__: f for f in (training, other_training)}
+    of_training = {f.__name__: f for f in (training, other_training, trained)}
 
     def made(found: re.Match[str]) -> str:
         if found[2] == "cost":

@@ -132,8 +132,8 @@ DIR  {_ONE_RUN}, of several keys, or of a training set
 
 The page of a key shows its maps over the image, the depth under the pointer, the cloud in 3-D,
 scores and costs. It is one HTML file that needs no network. It names files that are missing or
-damaged. The page of a training set is a table of its keys. The file is DIR/report.html, or
-DIR/compare.html for a comparison.
+damaged. The page of a training set has a verdict, the course of the scores, and pictures of the
+worst keys. The file is DIR/report.html, or DIR/compare.html for a comparison.
 
 == export (finished)
 write a finished run in the formats of other tools
