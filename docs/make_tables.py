@@ -31,13 +31,13 @@ NUMBERS = ROOT / "docs/numbers.json"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 FIGURES = ("num_pixels", "num_compared", "coverage", "outliers", "outliers_1_px", "mae_m")
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
-MEASURED = ("single sweep", "rigid (ICP)", "densify, measured")
+MEASURED = ("single sweep", "rigid (ICP)", "rigid, cleaned", "densify, measured")
 FILLED = ("single sweep, filled", "single sweep, IP-Basic", "densify, filled")
 METHODS = (*MEASURED, *FILLED)
 TITLES = dict(
     zip(
         METHODS,
-        ("single sweep", "rigid (ICP)", "densify measured")
+        ("single sweep", "rigid (ICP)", "rigid cleaned", "densify measured")
         + ("single sweep filled", "IP-Basic", "densify filled"),
         strict=True,
     )
@@ -94,12 +94,14 @@ def rows_of_truths(errors: Any, methods: Sequence[str], stored: gate.Stored | No
     for truth, (label, keys) in TRUTHS.items():
         for part in ("all", "moving"):
             texts = {}
-            for method in methods:
+            for method in METHODS:
                 kind = method.removeprefix("densify, ")
                 has_luck = kind != method and stored is not None
                 luck = (keys, f"{kind} {part}") if has_luck else ()
                 texts[method] = share(errors[truth][method][part], stored, *luck)
-            rows.append([label if part == "all" else "its moving pixels", *with_best(texts)])
+            cells = dict(zip(METHODS, with_best(texts), strict=True))
+            label_of_row = label if part == "all" else "its moving pixels"
+            rows.append([label_of_row, *(cells[method] for method in methods)])
     return table(["outliers in % (coverage)", *(TITLES[m] for m in methods)], rows)
 
 

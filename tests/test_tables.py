@@ -53,5 +53,5 @@ def test_a_share_of_few_pixels_is_no_figure(maker: Any) -> None:
     assert maker.share(cell, None) == "–"
     assert (
         maker.rows_of_parts("street, exact", methods, "mean absolute error in m")[0][1:]
-        == ["–"] * 6
+        == ["–"] * 7
     )

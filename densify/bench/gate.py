@@ -488,7 +488,7 @@ def errors_of_methods(
 def _maps(subject: Subject) -> dict[str, Float32]:
     """Return name of the method -> depth map (H,W) in metres, 0 for no depth."""
     key, camera = subject.key.key, subject.key.camera
-    results = densify(subject.recording, key, ["none", "icp", "flow"], [camera], Watch())
+    results = densify(subject.recording, key, ["none", "icp", "icp-visible", "flow"], [camera], Watch())
     sweep_m, ours = results["none"].depth[camera].depth_m, results["flow"].depth[camera]
     alone = Recording(subject.recording.sequence, resolve(_SINGLE_SWEEP), 0, [key])
     single = densify(alone, key, ["flow"], [camera], Watch())["flow"].depth[camera]
@@ -497,6 +497,7 @@ def _maps(subject: Subject) -> dict[str, Float32]:
         "single sweep, filled": single.filled_m,
         "single sweep, IP-Basic": ip_basic(sweep_m),
         "rigid (ICP)": results["icp"].depth[camera].depth_m,
+        "rigid, cleaned": results["icp-visible"].depth[camera].depth_m,
         "densify, measured": ours.depth_m,
         "densify, filled": ours.filled_m,
     }
