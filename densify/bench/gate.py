@@ -488,7 +488,8 @@ def errors_of_methods(
 def _maps(subject: Subject) -> dict[str, Float32]:
     """Return name of the method -> depth map (H,W) in metres, 0 for no depth."""
     key, camera = subject.key.key, subject.key.camera
-    results = densify(subject.recording, key, ["none", "icp", "icp-visible", "flow"], [camera], Watch())
+    methods = ("none", "icp", "icp-visible", "flow")
+    results = densify(subject.recording, key, methods, [camera], Watch())
     sweep_m, ours = results["none"].depth[camera].depth_m, results["flow"].depth[camera]
     alone = Recording(subject.recording.sequence, resolve(_SINGLE_SWEEP), 0, [key])
     single = densify(alone, key, ["flow"], [camera], Watch())["flow"].depth[camera]
