@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What commands read and print: options and their values; answers, progress and tables."""
+"""Read the options of commands, and print their answers, progress and tables."""
 
 from __future__ import annotations
 

@@ -79,8 +79,7 @@ def estimate_flow(
     clouds = checked_cloud(source, "source"), checked_cloud(target, "target")
     times_ns = _columns(source_offset_ns, target_offset_ns, clouds, "offset_ns")
     lidars = _columns(source_lidar, target_lidar, clouds, "lidar")
-    # The engine ``paper`` solves the published objective. So does ``groups`` without the static
-    # prior, because every point then needs a flow of its own.
+    # Without the static prior every point needs a flow of its own, as the objective gives it.
     if not settings.objective.static_prior or settings.flow.engine == "paper":
         return flow_between(*clouds, settings.objective, initial)
     initial_flow = None if initial is None else checked_cloud(initial, "initial")

@@ -214,11 +214,9 @@ def train(
     network = network.to(device=torch_device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.Adam(network.parameters())
     num_steps = max(steps, 3)  # the learning rate rises for two steps at least, and falls for one
+    rise = max(_WARM_UP, 2 / num_steps)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser,
-        plan.learning_rate,
-        total_steps=num_steps,
-        pct_start=max(_WARM_UP, 2 / num_steps),
+        optimiser, plan.learning_rate, total_steps=num_steps, pct_start=rise
     )
     image_sizes = np.array([sample.image.shape[1:] for sample in samples])
     height, width = np.minimum(_CROP_PX, image_sizes.min(0)).tolist()

@@ -60,7 +60,7 @@ _FAST_M_S = 1.0  # speed from which a moving point counts as fast
 _LEARNING_RATE = 2e-3
 _LARGEST_GRADIENT = 1.0  # norm of the gradient; a greater one is scaled down
 _WARM_UP, _COOL_DOWN = 0.05, 0.5  # shares of the training's steps
-_NUM_AVERAGED = 50  # number of last losses whose mean is told
+_NUM_AVERAGED = 50  # number of last losses whose mean is reported
 Predict = Callable[[Sweeps], Tensor]
 
 

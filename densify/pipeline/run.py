@@ -255,7 +255,7 @@ def scene_of(
         shots: Map name -> camera, image number and exposure time.
         images: Map name -> (H,W,3) RGB image.
         far_surfaces: Static surfaces beyond the window; None leaves them out.
-        cloud: Accumulated points, which say what moves in the key sweep that is held out.
+        cloud: Accumulated points. Its moving points mark those of the held-out key sweep.
         with_images: Colour the cloud, and score depth if there is ground truth.
     """
     sequence, settings = recording.sequence, recording.settings

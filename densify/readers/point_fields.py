@@ -201,8 +201,7 @@ def find_times(
     if absolute and stamps_ns is not None:
         timed_ns = np.array([stamps_ns[row] for row in timed], np.float64)
         middle_ns = float(np.median(middles_ns - timed_ns))
-    elif absolute:  # the stamps are made of these times
-        # Counted from the part of the sweep that becomes its stamp
+    elif absolute:  # these times become the stamps: count from the stamped part of the sweep
         middle_ns = {"middle": 0, "end": -1}.get(field.reference, 1) * reach_ns
     point_times = PointTimes(
         name,

@@ -55,8 +55,7 @@ def follow_road(
     chain = make_map()
     for registered, surface in zip(window_sweeps, window_surfaces, strict=True):
         chain.insert(surface.points, registered.T_world_lidar)
-    end_of_window = window_sweeps[-1]
-    # Pose and time of the end of the chain, and the velocity there
+    end_of_window = window_sweeps[-1]  # and first end of the chain
     T_world_lidar, end_ns = end_of_window.T_world_lidar, end_of_window.sweep.stamp_ns
     is_backwards = len(frames) > 0 and stamp_ns[0] < end_ns
     twist = end_of_window.twist_before if is_backwards else end_of_window.twist_after
