@@ -99,6 +99,16 @@ def test_a_preview_is_a_part_of_the_set(border_drive: Path, tmp_path: Path, caps
     assert "9 done" in page and "Preview" not in page
 
 
+def test_a_preview_measures_outliers(border_drive: Path, tmp_path: Path) -> None:
+    arguments = ("dataset", "--data", border_drive, *OPTIONS, "--method", "icp", "--out", tmp_path)
+    assert exit_code(*arguments, "--preview", "1") == 0
+    (record,) = records(tmp_path)
+    assert record["scores"]["outliers"][CAMERA] is not None
+    assert "Outliers of the median key, held out" in (tmp_path / "report.html").read_text()
+    config = json.loads((tmp_path / "dataset.json").read_text())["config"]
+    assert config["output"]["score"] is False  # the others are made without
+
+
 def test_shards_workers_and_a_killed_run_make_what_one_makes(
     empty_cache: Path, tmp_path: Path, monkeypatch
 ) -> None:
@@ -273,7 +283,7 @@ def test_keys_far_worse_than_those_around(shares: list, worse: list[int]) -> Non
     assert [key for _, key in worse_than_neighbours(drive_of(shares), 4.0)] == worse
 
 
-def test_outliers_count_by_the_worst_camera_and_only_of_keys_that_are_kept() -> None:
+def test_outliers_count_by_the_worst_camera_and_only_of_keys_that_are_made() -> None:
     records = drive_of([0.0] * 12, outliers={"a": 0.01, "b": None})
     bad = replace(records[DRIVE, 4], scores={"ghost": 0, "outliers": {"a": 0.01, "b": 0.05}})
     records[bad.name] = bad
@@ -281,6 +291,8 @@ def test_outliers_count_by_the_worst_camera_and_only_of_keys_that_are_kept() -> 
     assert name == (DRIVE, 4) and text.startswith("held-out outliers 5 %, more than 4 times the")
     assert "ghosts" not in text
     records[bad.name] = replace(bad, status="aside", reason="outliers")
+    assert [*worse_than_neighbours(records, 4.0)] == [bad.name]  # it would be so again
+    records[bad.name] = replace(bad, status="failed", reason="torn")
     assert not worse_than_neighbours(records, 4.0)
 
 
@@ -305,6 +317,15 @@ def test_a_key_far_worse_than_its_neighbours_is_put_aside(
     assert keys_of(maps_in(out)) == {*FRAMES} - {FRAMES[0]}
     assert [sample["frame"] for sample in DepthDataset(out)] == [*FRAMES][1:]
     (page,) = write_report(out)
-    assert page.read_text().count(reason) == 2  # with its picture, and in the table
+    assert page.read_text().count(reason) == 3  # with its picture, counted, and in the table
     assert (out / "aside" / DRIVE / f"{FRAMES[0]:010d}.jpg").is_file()
     assert f"put aside ({reason})" in (out / "densify.log").read_text()
+
+    # Other limits make it again, and put the same key aside for another reason.
+    again = ("dataset", "--data", border_drive, *cheap, "--out", out, "--set")
+    assert exit_code(*again, "dataset.max_ratio=null") == 0
+    assert keys_of(maps_in(out)) == {*FRAMES} and not [*out.rglob("*.jpg")]
+    both = ("dataset.max_ratio=null", "--set", "dataset.max_ghost=0.01")
+    assert exit_code(*again, *both) == 0
+    assert keys_of(maps_in(out)) == {*FRAMES} - {FRAMES[0]}
+    assert "expected at most 0.01" in records(out)[0]["reason"]

@@ -114,7 +114,7 @@ def test_foreign_and_damaged_folders_stay(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--set", "dataset.max_ghost=0.5"], "gate.max_ghost = None, got 0.5"),
+        (["--set", "dataset.split=val"], "gate.split = kitti, got val"),
         (["--window", "3"], "window = 2, got 3"),
         ([], "config.flow.gone = 10.0, got None"),
     ],

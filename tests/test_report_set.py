@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +15,9 @@ import pytest
 
 import densify
 from densify.config.errors import InputError
+from densify.dataset.judged_set import limits_of, read_judged
 from densify.dataset.manifest import FileRecord, KeyRecord, describe_pace, describe_rest
-from densify.dataset.plan import Recipe, plan, write_plan
+from densify.dataset.plan import Gate, Recipe, plan, write_plan
 from densify.dataset.report import write_report
 from tests.command import refused
 from tests.dataset_scenes import DRIVE, FRAMES
@@ -24,6 +26,15 @@ from tests.dataset_scenes import DRIVE, FRAMES
 def scored(key: int) -> KeyRecord:
     scores = {"num_points": 9, "ghost": key % 4 / 100, "density": {"image_02": 0.5}}
     return KeyRecord(DRIVE, key, "done", frames=(key,), scores=scores, seconds=2.0)
+
+
+def with_cameras(key: int, front: float, left: float, outliers: float = 0.005) -> KeyRecord:
+    scores = {
+        "ghost": 0.001,
+        "density": {"front": front, "left": left},
+        "outliers": {"front": outliers, "left": None},
+    }
+    return replace(scored(key), scores=scores)
 
 
 @pytest.fixture
@@ -45,9 +56,9 @@ def page_of(root: Path) -> str:
 def rows_of(page: str, heading: str) -> list[list[str]]:
     """Return the cells of the table below a heading, without its head."""
     table = page.partition(f"<h2>{heading}</h2>")[2].partition("</table>")[0]
-    table = re.sub(r"</?(a|b)\b.*?>", "", table)
+    table = re.sub(r"</?(a|b|code)\b.*?>", "", table)
     rows = re.findall(r"<tr.*?>(.*?)</tr>", table)
-    return [cells for row in rows if (cells := re.findall(r"<td>(.*?)</td>", row))]
+    return [cells for row in rows if (cells := re.findall(r"<td.*?>(.*?)</td>", row))]
 
 
 def test_keys_with_the_most_ghosts_come_first(described: Path) -> None:
@@ -56,12 +67,51 @@ def test_keys_with_the_most_ghosts_come_first(described: Path) -> None:
     rows = rows_of(page, "All keys, worst first")
     assert "9 done; 2.0 s a key" in page and page.count("<svg") == 3  # ghosts, measured, time
     assert float(rows[0][1]) == 3 and {row[2] for row in rows} == {"50.0"}
-    assert "<td><b>3</b></td>" in page  # the score that ranks the key
+    assert rows_of(page, "Scores")[0][4] == "6"  # suspect: all but those without ghosts
     assert len(rows) == len(FRAMES) == page.count("<circle") / 3
-    assert (
-        "front camera, moving vehicle): ghosts. See" in page and "Outliers are not measured" in page
-    )
+    assert '<p class="verdict bad">' in page and "moving vehicle): ghosts" in page
+    assert "Outliers are not measured" in page
     assert (write_report(described)[0]).read_text() == page  # to the last byte, figures too
+
+
+def test_coverage_is_judged_by_the_other_keys_of_the_camera(described: Path) -> None:
+    """A side camera has less depth than KITTI's front camera, and no key of it is suspect."""
+    keys = [with_cameras(key, 0.45, 0.15) for key in FRAMES]
+    write_manifest(described, *keys)
+    assert '<p class="verdict good">' in page_of(described)
+    keys[4] = with_cameras(FRAMES[4], 0.45 - 0.15, 0.15)
+    keys[6] = with_cameras(FRAMES[6], 0.45, 0.15, outliers=0.02)
+    write_manifest(described, *keys)
+    judged = read_judged(described)
+    found = {
+        key: [(j.series.score.name, j.series.camera) for j in j_all]
+        for (_, key), j_all in judged.suspects.items()
+    }
+    assert found == {FRAMES[4]: [("density", "front")], FRAMES[6]: [("outliers", "front")]}
+    assert {record.key for record in judged.worst_first[:2]} == {FRAMES[4], FRAMES[6]}
+    page = page_of(described)
+    assert '<p class="verdict look">' in page and "2 of 9 keys are suspect" in page
+    assert "measured depth of front 30.0 %, median 45.0 %" in page
+    assert page.count("camera-1") > len(FRAMES)  # dots of the second camera
+
+
+def test_a_limit_tells_how_many_keys_it_puts_aside(described: Path) -> None:
+    write_manifest(
+        described, *(replace(scored(key), scores={"ghost": key / 10_000}) for key in range(40))
+    )
+    judged = read_judged(described)
+    limits = {limit.setting: limit.num_lost for limit in limits_of(judged)}
+    assert limits == {
+        "dataset.max_ghost=0.0038": 1,
+        "dataset.max_ghost=0.0037": 2,
+        "dataset.max_ghost=0.0035": 4,
+    }
+    for setting, num_lost in limits.items():
+        gate = Gate(max_ghost=float(setting.partition("=")[2]))
+        reasons = [
+            gate.reason({**r.scores, "density": {}, "outliers": {}}, 9) for r in judged.records
+        ]
+        assert sum(reason is not None for reason in reasons) == num_lost
 
 
 def test_keys_that_are_not_done_say_why(described: Path) -> None:
@@ -69,16 +119,21 @@ def test_keys_that_are_not_done_say_why(described: Path) -> None:
     torn = KeyRecord(DRIVE, 99, "failed", "torn")
     write_manifest(described, *map(scored, FRAMES[:3]), aside, torn)
     page = page_of(described)
-    rows = {row[0]: html.unescape(row[-1]) for row in rows_of(page, "Failed or put aside")}
-    assert rows == {"key 39": "aside: ghost rate <b>", "key 99": "failed: torn"}
-    assert "3 done, 1 put aside, 1 failed, 5 to make" in page and 'class="hollow"' in page
+    rows = rows_of(page, "Failed or put aside")
+    texts = [html.unescape(row[-1]) for row in rows]
+    assert [row[0] for row in rows[::2]] == ["key 39", "key 99"]
+    assert texts[1::2] == ["aside: ghost rate <b>", "failed: torn"]
+    assert [row[1] for row in rows_of(page, "Reasons and warnings")] == ["1", "1"]
+    assert "3 done, 1 put aside, 1 failed, 5 to make" in page
+    assert "hollow" in page and page.count('<path class="failed"') == 3  # in each plot
     assert "<b>Not finished: 4 of 9 keys</b>; the other 5 keys take about" in page
 
 
-def test_pictures_show_the_image_filled_depth_and_confidence(described: Path) -> None:
+def test_pictures_show_the_image_depth_and_confidence(described: Path) -> None:
     depth, confidence = np.full((40, 80), 256 * 10, np.uint16), np.full((40, 80), 255, np.uint8)
     files = {}
-    for kind, pixels in (("groundtruth_filled", depth), ("confidence", confidence)):
+    maps = (("groundtruth", depth), ("groundtruth_filled", depth), ("confidence", confidence))
+    for kind, pixels in maps:
         name = f"val/{DRIVE}/proj_depth/{kind}/image_02/{FRAMES[0]:010d}.png"
         (described / name).parent.mkdir(parents=True)
         cv2.imwrite(str(described / name), pixels)
@@ -88,14 +143,15 @@ def test_pictures_show_the_image_filled_depth_and_confidence(described: Path) ->
     write_manifest(described, first, replace(scored(FRAMES[1]), files=lost))
     page = page_of(described)
     alts = re.findall(r'<img alt="(.*?)" src="data:image/jpeg', page)
-    assert alts == [
-        f"{kind}, key 36" for kind in ("image image_02", "filled depth image_02", "confidence")
-    ]
+    kinds = ("image image_02", "measured depth image_02", "filled depth image_02", "confidence")
+    assert sorted(alts) == sorted(f"{kind}, key 36" for kind in kinds)
+    links = set(re.findall(r'<a href="(val/.*?)"', page))
+    assert links == {*files, *lost}
     assert "lost.png: cannot be read" in page
     (described / "dataset.json").write_text(
         (described / "dataset.json").read_text().replace('"data": "', '"data": "/moved')
     )
-    assert page_of(described).count("<img") == 2  # the recording is no longer there
+    assert page_of(described).count("<img") == 3  # the recording is no longer there
 
 
 def test_the_slowest_key_has_no_part_in_the_time_of_the_others() -> None:
@@ -103,6 +159,29 @@ def test_the_slowest_key_has_no_part_in_the_time_of_the_others() -> None:
     assert describe_pace(records) == "9.0 s a key (6.0 to 100.0)"
     assert describe_rest(records, 60) == "the other 60 keys take about 6 to 9 min in one process"
     assert describe_rest(records[:1], 60) == "60 keys are left"
+    files = {"a": FileRecord(800_000, "")}
+    made = [replace(record, files=files) for record in records]
+    rest = "the other 9,992 keys take about 17 to 25 h in one process and 8.0 GB"
+    assert describe_rest(made, 9_992) == rest
+    assert describe_rest(made, 2).endswith("about 12 to 18 s in one process and 2 MB")
+
+
+def test_the_page_of_many_recordings_stays_whole(described: Path) -> None:
+    """Every link has its target, and every mark lies within its plot."""
+    plan_file = described / "dataset.json"
+    table = json.loads(plan_file.read_text())
+    (drive,) = table["drives"].values()
+    names = [f"drive_{number:03d}" for number in range(150)]
+    table["drives"] = {n: {**drive, "folder": f"val/{n}", "frames": [[0, 19]]} for n in names}
+    plan_file.write_text(json.dumps(table))
+    records = (replace(scored(key), drive=name) for name in names for key in range(20))
+    write_manifest(described, *records)
+    page = page_of(described)
+    targets = set(re.findall(r'<a href="#(.*?)"', page))
+    assert len(targets) > 500 and targets <= set(re.findall(r'id="(.*?)"', page))
+    across_px = [float(x) for x in re.findall(r'<circle cx="(.*?)"', page)]
+    assert min(across_px) > 0 and max(across_px) <= 400
+    assert len(rows_of(page, "Recordings")) == 12 and "The other recordings" in page
 
 
 def test_a_key_leads_to_its_own_page_and_many_keys_have_a_histogram(described: Path) -> None:
@@ -110,9 +189,8 @@ def test_a_key_leads_to_its_own_page_and_many_keys_have_a_histogram(described: P
     keys = (replace(scored(key), files=files if key == 1 else {}) for key in range(25))
     write_manifest(described, *keys)
     page = page_of(described)
-    assert '<a href="000001/report.html">key 1</a>' in page and "<rect" in page
+    assert '<a href="000001/report.html">key 1</a>' in page and 'class="bar"' in page
     assert page.count('class="usual"') == 2  # of ghosts and measured depth
-    assert set(re.findall(r'<a href="#(row.*?)"', page)) <= set(re.findall(r'id="(row.*?)"', page))
 
 
 def test_the_manifest_is_a_table(described: Path) -> None:

@@ -36,6 +36,7 @@ from densify.dataset.manifest import (
 )
 from densify.dataset.plan import (
     Drive,
+    Gate,
     Recipe,
     choose_spread,
     plan,
@@ -43,7 +44,7 @@ from densify.dataset.plan import (
     read_plan,
     write_plan,
 )
-from densify.dataset.report import FILLED, find_map, front_camera, keep_picture
+from densify.dataset.report import FILLED, find_map, front_camera, keep_picture, kept_picture
 from densify.flow.engines import check_engine
 from densify.geometry.compiled import num_threads
 from densify.geometry.types import Result
@@ -107,22 +108,21 @@ def make_dataset(
 ) -> Summary:
     """Make a training set from the key sweeps of whole recordings, and return the final progress.
 
-    A repeated call keeps finished key sweeps. Files do not depend on processes or interruptions. A
-    full disk or the loss of all workers raises ComputationError, and finished key sweeps are kept.
+    A repeated call keeps finished key sweeps, also after an error. With other limits in
+    ``recipe.gate`` it puts key sweeps aside, or makes them again. Files do not depend on processes
+    or interruptions. A full disk or the loss of all workers raises ComputationError.
 
     Args:
         data: Recordings, each a text for `densify.open_sequence`.
         out: Folder of the training set.
         keys: Existing frame numbers from ``start`` to ``stop`` - 1 by ``step``. None for all.
         recipe: Window, method, cameras, limits of the scores, and settings. None uses the defaults.
-        num_workers: Number of processes, as many as possible if None. More than one needs ``if
-            __name__ == "__main__"`` in a script.
+        num_workers: Number of processes, None for many. In a script they need a ``__main__`` guard.
         scheduler: Address of a Dask scheduler whose workers replace local processes. They need the
             same files at the same paths. ``tcp://`` trusts everybody on that network.
         shard: (i, n), part i of n, from 1. Machines that share ``out`` may make parts at once.
         verify: Compare finished files with their recorded hashes, and make damaged files again.
-        preview: Make only this number of keys, spread over all. They are not compared with their
-            neighbours before a later call makes the others.
+        preview: Make only this number of keys, spread over all, and measure held-out outliers.
         report: Function called with the progress, before the first and after every key sweep.
     """
     if isinstance(data, str) or not data:
@@ -142,10 +142,11 @@ def make_dataset(
             clear_leftovers(out, age_s)
             if recipe.layout == "kitti-depth":
                 write_readme(out, recipe.method, recipe.window, as_mapping(recipe.config))
-            blocks = _blocks(drives, shard, recipe, out)
-            num_keys, records = sum(map(len, blocks)), _finished(blocks, out, verify)
-            groups = _left(blocks, records.keys(), num_workers)
+            blocks = _blocks(drives, shard, recipe, out, is_scored=preview is not None)
+            records = _finished(blocks, out, verify, recipe.gate if preview is None else None)
+            num_keys = sum(map(len, blocks))
             _log.info("%d of %d keys finished, %d worker(s)", len(records), num_keys, num_workers)
+            groups = _left(blocks, records.keys(), num_workers)
             outcomes = call_all(make_key, groups, num_workers, log, scheduler)
             summary = _record(outcomes, manifest, records, num_keys, report)
             if preview is None:
@@ -205,22 +206,34 @@ def _free_bytes() -> float:
     return min(sizes)
 
 
-def _blocks(drives: Sequence[Drive], shard: Shard | None, recipe: Recipe, out: Path) -> list[_Keys]:
+def _blocks(
+    drives: Sequence[Drive], shard: Shard | None, recipe: Recipe, out: Path, is_scored: bool
+) -> list[_Keys]:
     """Return the key sweeps of each block, or of the consecutive blocks of one shard."""
     run, blocks = uuid4().hex, list[_Keys]()
     for drive in drives:
-        job = Job(drive, recipe, out.absolute(), run)
+        job = Job(drive, recipe, out.absolute(), run, is_scored)
         blocks += [[(job, key) for key in keys] for keys in drive.blocks]
     number, num_shards = shard or (1, 1)
     begin, end = (len(blocks) * part // num_shards for part in (number - 1, number))
     return blocks[begin:end]
 
 
-def _finished(blocks: Sequence[_Keys], out: Path, verify: bool) -> dict[Key, KeyRecord]:
-    """Return the records of the finished key sweeps in these blocks, sorted by key."""
+def _finished(
+    blocks: Sequence[_Keys], out: Path, verify: bool, gate: Gate | None
+) -> dict[Key, KeyRecord]:
+    """Return the records of the finished key sweeps in these blocks, sorted by key.
+
+    Key sweeps that were put aside are finished if they are beyond a limit of ``gate``, if given.
+    """
     wanted = {(job.drive.name, key) for block in blocks for job, key in block}
     before = read_manifests(out)
-    return {name: before[name] for name in sorted(wanted & finished(before.values(), out, verify))}
+    names = sorted(wanted & finished(before.values(), out, verify))
+    records = {name: before[name] for name in names}
+    if gate is None:
+        return records
+    beyond = beyond_limits(records, gate)
+    return {name: r for name, r in records.items() if r.status == "done" or name in beyond}
 
 
 def _left(blocks: Sequence[_Keys], done: Collection[Key], num_workers: int) -> list[_Keys]:
@@ -273,7 +286,7 @@ def _set_aside(
     out: Path,
     drives: Sequence[Drive],
 ) -> dict[Key, KeyRecord]:
-    """Put keys far worse than their neighbours aside, and return their new records by key."""
+    """Put the keys beyond a limit aside, and return their new records by key."""
     drive_of = {drive.name: drive for drive in drives}
 
     def keep(record: KeyRecord) -> list[Path]:
@@ -288,13 +301,21 @@ def _set_aside(
             return []
         return [keep_picture(out, drive, record.key, filled_m)]
 
-    max_ratio = recipe.gate.max_ratio
-    worse = {} if max_ratio is None else worse_than_neighbours(records, max_ratio)
-    return {record.name: record for record in manifest.set_aside(worse, keep)}
+    beyond = beyond_limits(records, recipe.gate)
+    return {record.name: record for record in manifest.set_aside(beyond, keep)}
+
+
+def beyond_limits(records: Mapping[Key, KeyRecord], gate: Gate) -> dict[Key, str]:
+    """Return key -> reason, for the made keys, kept or put aside, that are beyond a limit."""
+    ratio = gate.max_ratio
+    worse = {} if ratio is None else worse_than_neighbours(records, ratio)
+    made = ((name, record) for name, record in records.items() if record.status != "failed")
+    own = {name: gate.reason(record.scores, len(record.frames)) for name, record in made}
+    return worse | {name: reason for name, reason in own.items() if reason is not None}
 
 
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
-    """Return finished key -> reason, for keys with far more ghosts or outliers than neighbours.
+    """Return made key -> reason, for keys with far more ghosts or outliers than neighbours.
 
     Such a share exceeds what is usual on KITTI (0.75 % ghosts, 0.9 % held-out outliers), and
     ``max_ratio`` times the median of the neighbours in the recording. Unlike a limit for all
@@ -320,7 +341,7 @@ def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) ->
                 # With a single neighbour it is unknown which of the two keys is unusual.
                 median = float(np.median(beside)) if len(beside) > 1 else np.inf
                 bound = max(USUAL_SHARES[score][1], max_ratio * median)
-                if record.status == "done" and shares[row] > bound:
+                if shares[row] > bound:
                     worse[record.name].append(
                         f"{title} {100 * shares[row]:.2g} %, more than {max_ratio:g} times the "
                         f"{100 * median:.2g} % of the neighbouring keys (median)"
@@ -339,6 +360,7 @@ class Job:
     recipe: Recipe
     out: Path  # absolute folder of the training set
     run: str  # unique text of the command's run; long-lived workers reopen the recording in each
+    is_scored: bool  # measure outliers with the key sweep held out, whatever the recipe
     version: str = __version__  # version of densify that made the job
 
 
@@ -364,11 +386,14 @@ def make_key(job_and_key: tuple[Job, int]) -> KeyRecord:
         else:
             reason = f"this is a bug in densify; please report it with densify.log: {reason}"
         record = KeyRecord(job.drive.name, key, "failed", reason)
-    return replace(record, seconds=time.perf_counter() - start_s)
+    return replace(record, seconds=time.perf_counter() - start_s - record.seconds)
 
 
 def _densified(job: Job, key: int) -> KeyRecord:
-    """Densify one key, write the files if its scores are within the limits, return its record."""
+    """Densify one key, write the files if its scores are within the limits, return its record.
+
+    ``seconds`` are those to subtract from the computing time: of scores that the recipe leaves out.
+    """
     recipe = job.recipe
     recording, cache = _opened(job)
     is_tree = recipe.layout == "kitti-depth"
@@ -380,7 +405,10 @@ def _densified(job: Job, key: int) -> KeyRecord:
     result = results[recipe.method]
     scores = _scores(result.metrics)
     reason = recipe.gate.reason(scores, len(result.frames))
+    if reason is None:
+        kept_picture(job.out, job.drive, key).unlink(missing_ok=True)  # put aside before
     paths = _write(job, results) if reason is None else _keep_result(job, result)
+    costs = () if recipe.config.is_scored else result.costs
     return KeyRecord(
         job.drive.name,
         key,
@@ -389,6 +417,7 @@ def _densified(job: Job, key: int) -> KeyRecord:
         frames=result.frames,
         files=describe_files(job.out, paths),
         scores=scores,
+        seconds=sum(cost.seconds for cost in costs if cost.name == "held out"),
         warnings=result.warnings,
     )
 
@@ -404,6 +433,7 @@ def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Return the scores for a manifest line from the metrics of a result."""
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
+    expected = metrics.get("expected_outliers", {})
     return {
         "num_points": metrics["num_points"],
         "num_moving": metrics["num_moving"],
@@ -411,6 +441,7 @@ def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
         "density": {name: shares["measured"] for name, shares in metrics["density"].items()},
         "density_filled": {name: shares["filled"] for name, shares in metrics["density"].items()},
         "outliers": {name: scores["outliers"] for name, scores in errors.items()},
+        "expected_outliers": {name: shares["measured"] for name, shares in expected.items()},
         "mae_m": {name: scores["mae_m"] for name, scores in errors.items()},
     }
 
@@ -433,8 +464,9 @@ def _opened(job: Job) -> tuple[Recording, Cache]:
             f"{job.version}; install the same on both"
         )
     cache, recipe, keys = Cache(), job.recipe, job.drive.keys
+    config = recipe.config.scored() if job.is_scored else recipe.config
     sequence, around = open_sequence(job.drive.data), looks_around([recipe.method])
     recording = Recording(
-        sequence, recipe.config, recipe.window, keys, cache, job.run, looks_around=around
+        sequence, config, recipe.window, keys, cache, job.run, looks_around=around
     )
     return recording, cache

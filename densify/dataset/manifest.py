@@ -21,6 +21,7 @@ import fcntl
 import hashlib
 import json
 import logging
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -44,6 +45,7 @@ _log = logging.getLogger("densify")
 USUAL_SHARES: Mapping[str, tuple[float, float]] = {
     "ghost": (0.0005, 0.0075),
     "outliers": (0.0006, 0.009),
+    "expected_outliers": (0.0035, 0.0079),
     "density": (0.36, 0.50),
     "density_filled": (0.49, 0.62),
 }
@@ -159,16 +161,31 @@ def describe_pace(records: Iterable[KeyRecord]) -> str:
 
 
 def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:
-    """Return the expected time of the ``num_left`` keys as text, their number if unknown, or ""."""
-    seconds = sorted(record.seconds for record in records)
-    if len(seconds) < 2 or not num_left:
+    """Return the expected time and disk space of the ``num_left`` keys as text, "" for no keys."""
+    records = list(records)
+    if len(records) < 2 or not num_left:
         return f"{num_left:,} keys are left" if num_left else ""
-    usual_s = seconds[:-1]  # the slowest key waited for compilation
+    usual_s = sorted(record.seconds for record in records)[
+        :-1
+    ]  # the slowest waited for compilation
     # Quartiles. A few slow keys may raise the mean, which the sum follows, above the upper one.
     low_s, high_s = np.quantile(usual_s, 0.25), max(np.quantile(usual_s, 0.75), np.mean(usual_s))
-    low, high = (f"{num_left * value / 60:.0f}" for value in (low_s, high_s))
-    span = high if low == high else f"{low} to {high}"
-    return f"the other {num_left:,} keys take about {span} min in one process"
+    sizes = [sum(f.num_bytes for f in r.files.values()) for r in records if r.status == "done"]
+    disk = f" and {_size(num_left * float(np.mean(sizes)))}" if any(sizes) else ""
+    span = _duration(num_left * low_s, num_left * high_s)
+    return f"the other {num_left:,} keys take about {span} in one process{disk}"
+
+
+def _duration(low_s: float, high_s: float) -> str:
+    """Return a range of times in the unit that people use for the longer one."""
+    units = ((1, "s", 120), (60, "min", 7200), (3600, "h", math.inf))
+    factor, unit, _ = next(row for row in units if high_s < row[2])
+    low, high = (f"{max(1.0, value / factor):.0f}" for value in (low_s, high_s))
+    return f"{high} {unit}" if low == high else f"{low} to {high} {unit}"
+
+
+def _size(num_bytes: float) -> str:
+    return f"{num_bytes / 1e9:.1f} GB" if num_bytes >= 1e9 else f"{num_bytes / 1e6:.0f} MB"
 
 
 def read_manifests(root: Path) -> dict[Key, KeyRecord]:

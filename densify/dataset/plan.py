@@ -35,8 +35,8 @@ SCHEMA_VERSION = 1
 _KNOWN = {"method": ("flow", "icp", "none"), "layout": ("kitti-depth", "densify")}
 _FILE = "dataset.json"
 _MOST_FRAMES = 10_000_000
-_SAME = ("densify", "layout", "method", "window", "cameras", "gate", "config")
-"""Entries of dataset.json that must be equal in all runs for a training set."""
+_RECIPE = ("densify", "layout", "method", "window", "cameras", "gate", "config")
+"""Entries of dataset.json that must be equal in all runs for a training set, but for limits."""
 _CAMERA = [f.name for f in fields(Camera) if f.name != "name"]
 
 
@@ -204,7 +204,8 @@ def _keys(sequence: LidarSequence, keys: slice | None, spec: str) -> tuple[int, 
 def write_plan(out: Path, recipe: Recipe, drives: Sequence[Drive]) -> None:
     """Write ``dataset.json``, or extend the plan of an earlier run with the same recipe.
 
-    InputError is raised if the earlier recipe or recordings differ.
+    The limits of the scores may differ, and the new ones replace the earlier ones. InputError is
+    raised if the rest of the recipe or the recordings differ.
     """
     table = _table(recipe, drives)
     before = read_plan(out)
@@ -225,7 +226,7 @@ def read_plan(out: Path) -> dict[str, Any] | None:
         table = read_json(path)
         if table["schema_version"] == SCHEMA_VERSION:
             drives_of(table)
-            return {name: table[name] for name in ("schema_version", *_SAME, "drives")}
+            return {name: table[name] for name in ("schema_version", *_RECIPE, "drives")}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
         raise InputError(
@@ -282,9 +283,10 @@ def _table(recipe: Recipe, drives: Sequence[Drive]) -> dict[str, Any]:
 
 def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError if a set was made with another recipe or another version of densify."""
-    expected, got = (_flat({name: table[name] for name in _SAME}) for table in (before, now))
+    expected, got = (_flat({name: table[name] for name in _RECIPE}) for table in (before, now))
+    limits = {f"gate.{name}" for name in asdict(Gate()) if name != "split"}
     for option in {**expected, **got}:
-        if got.get(option) != expected.get(option):
+        if option not in limits and got.get(option) != expected.get(option):
             raise InputError(
                 f"--out {out}: the set in it was made with {option} = {expected.get(option)}, "
                 f"got {got.get(option)}; choose another --out, or go on with the same options"

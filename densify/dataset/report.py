@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import base64
 import html
-import math
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import repeat
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 import cv2
@@ -23,39 +23,57 @@ import yaml
 from numpy.typing import NDArray
 
 from densify.config.errors import InputError
-from densify.dataset.manifest import (
-    USUAL_SHARES,
-    Key,
-    KeyRecord,
-    describe_pace,
-    describe_rest,
-    read_manifests,
+from densify.dataset.judged_set import (
+    SCORES,
+    JudgedSet,
+    Score,
+    Series,
+    count_messages,
+    limits_of,
+    read_judged,
 )
-from densify.dataset.plan import Drive, drives_of, planned_keys, read_plan
+from densify.dataset.manifest import Key, KeyRecord, describe_pace, describe_rest
+from densify.dataset.plan import Drive, planned_keys
 from densify.depth.exposure import key_shots
 from densify.geometry.types import METHOD_NAMES, Float32, LidarSequence
 from densify.outputs.depth_png import Picture, encode_jpeg, metres, read_stored
 from densify.outputs.folders import write_file
-from densify.outputs.plots import Dot, depth_over_image, order_front_first, score_plot
+from densify.outputs.plots import (
+    FEWEST_IN_HISTOGRAM,
+    Axis,
+    Dot,
+    depth_over_image,
+    order_front_first,
+    score_plot,
+)
 from densify.outputs.report_page import PAGES, fill_template, write_key_page
 from densify.readers import open_sequence
 
 FILLED = ("depth_filled", "groundtruth_filled")
 """Folders of the maps of filled depth, in the two layouts."""
+_MEASURED = ("depth", "groundtruth")
 _ASIDE = "aside"  # folder of the pictures of keys that are put aside, in a training set
-_WIDTH_PX = 400
-_QUALITY = 80
-_NUM_WORST, _NUM_SPREAD = 6, 18  # keys with pictures: the worst, and others spread over the set
+_WIDTH_PX = 620
+_QUALITY = 75
+_NUM_WORST, _NUM_SPREAD = 6, 12  # keys with pictures: the worst, and others spread over the set
+_NUM_DRIVES = 12  # recordings in the first table, the others are folded
 _NUM_ASIDE = 12  # keys with pictures among those put aside
 _NUM_LISTED = 1000  # rows of the table of keys, the worst first
 _NUM_DOTS = 1000  # of a plot, half of them the worst keys
-_LEAST_GRAY = 40  # of confidence 0; black is no depth
+_NUM_NAMED = 4  # suspect keys that the verdict names
+_NUM_MESSAGES = 20  # rows of the table of reasons and warnings
+_FEWEST_IN_RANGE = 20  # keys; fewer have no share of 5 to 95 %
 _MANY_ASIDE = 0.1  # a greater share of keys put aside or failed is reported in the verdict
+# Gray of confidence from 0.2, 10 % expected outliers, to 0.8, 0.01 %
+_GRAY, _CONFIDENCE = (50, 255), (0.2, 0.8)
+_NO_DEPTH_RGB = (28, 36, 78)
+_USUAL = "KITTI drive 0013 (64 rings, front camera, moving vehicle)"
 # Limit of the recipe -> factor of its unit, and when a key is not kept
 _LIMITS = {
     "max_ratio": (
         1,
-        "its ghosts or held-out outliers are more than usual and {:g} × its neighbours'",
+        "its ghosts or held-out outliers are more than usual and {:g} times those of the keys "
+        "around it",
     ),
     "max_ghost": (100, "its ghosts exceed {:g} %"),
     "max_outliers": (100, "its held-out outliers exceed {:g} %"),
@@ -64,132 +82,62 @@ _LIMITS = {
 }
 
 
-class _Score(NamedTuple):
-    """A score of a key that the page shows."""
-
-    name: str  # name in a manifest line
-    title: str
-    is_bad: int  # 1 if a high value is bad, -1 if a low value is, 0 if neither
-    limit: str = ""  # name of the limit in the recipe
-    unit: str = "%"
-
-    def of(self, record: KeyRecord) -> float | None:
-        """Return the score of a key's worst camera in ``unit``; None if unknown."""
-        if self.name == "seconds":
-            return record.seconds
-        values = record.values_of(self.name)
-        return 100 * (max(values) if self.is_bad > 0 else min(values)) if values else None
-
-    def camera_of(self, record: KeyRecord) -> str | None:
-        """Return the name of the worst camera of a key, None if the score has no cameras."""
-        values = record.scores.get(self.name)
-        if not isinstance(values, Mapping):
-            return None
-        known = {name: value for name, value in values.items() if value is not None}
-        return max(known, key=lambda name: self.is_bad * known[name], default=None)
-
-    def usual(self) -> list[float]:
-        """Return the ends of the range on KITTI in ``unit``, [] if unknown."""
-        return [100 * share for share in USUAL_SHARES.get(self.name, ())]
-
-    def is_worse_than_usual(self, value: float) -> bool:
-        """Return True if a value in ``unit`` lies beyond the bad end of the range on KITTI."""
-        usual = self.usual()
-        return bool(usual) and self.is_bad * value > max(self.is_bad * end for end in usual)
-
-
-_SCORES = (
-    _Score("ghost", "Ghosts", 1, "max_ghost"),
-    _Score("outliers", "Held-out outliers", 1, "max_outliers"),
-    _Score("density", "Measured depth", -1, "min_density"),
-    _Score("density_filled", "Filled depth", -1),
-    _Score("seconds", "Computing time", 0, unit="s"),
-)
-
-
-class _Set(NamedTuple):
-    """The content of a training set, from which the parts of its page are made."""
-
-    root: Path
-    table: Mapping[str, Any]  # content of dataset.json
-    drives: Mapping[str, Drive]
-    records: Sequence[KeyRecord]  # ordered by recording and frame
-    worst_first: Sequence[KeyRecord]  # the keys that are done
-    worst_score: Mapping[Key, str]  # key -> name of the score that ranks it
-    scores: Sequence[_Score]  # the scores that a key of the set has
-
-    def values(self, score: _Score) -> list[float]:
-        """Return the known values of a score of the keys that are done."""
-        return [value for record in self.worst_first if (value := score.of(record)) is not None]
-
-    def name_of(self, record: KeyRecord) -> str:
-        """Return a key's name, with the recording if there are several."""
-        return f"{record.drive}, key {record.key}" if len(self.drives) > 1 else f"key {record.key}"
-
-    def marked(self, record: KeyRecord, score: _Score, text: str) -> str:
-        """Return the text of a score of a key as HTML, bold if this score ranks the key."""
-        return f"<b>{text}</b>" if self.worst_score.get(record.name) == score.name else text
-
-
-def _read_set(root: Path) -> _Set:
-    table = read_plan(root) or {}
-    drives = drives_of(table)
-    records = [record for record in read_manifests(root).values() if record.drive in drives]
-    done = [record for record in records if record.status == "done"]
-    # A key is as bad as its worst score. Scores compare by their distance from the median of the
-    # set, in widths of the range that is usual on KITTI.
-    badness = {record.name: (-math.inf, "") for record in done}
-    for score in (score for score in _SCORES if score.usual()):
-        low, high = score.usual()
-        values = {r.name: value for r in done if (value := score.of(r)) is not None}
-        for name, value in values.items():
-            distance = score.is_bad * (value - float(np.median([*values.values()])))
-            badness[name] = max(badness[name], (distance / (high - low), score.name))
-    worst_first = sorted(done, key=lambda record: badness[record.name][0], reverse=True)
-    worst_score = {name: score for name, (_, score) in badness.items()}
-    scores = [score for score in _SCORES if any(score.of(r) is not None for r in records)]
-    return _Set(root, table, drives, records, worst_first, worst_score, scores)
-
-
 def _set_page(root: Path, command: str) -> bytes:
     """Return the bytes of the page of a training set; ``command`` continues a preview."""
-    made = _read_set(root)
+    made = read_judged(root)
     left_out = [record for record in made.records if record.status != "done"]
-    pictured = _chosen_for_pictures(made.worst_first)
-    aside = [record for record in left_out if record.files][:_NUM_ASIDE]
-    with_card = {record.name for record in (*pictured, *aside)}
+    worst = made.worst_moments(_NUM_WORST)
+    spread = _spread(made, worst)
+    aside = _worst_aside(made, left_out)
+    cards = {record.name: _anchor("card", record) for record in (*worst, *spread, *aside)}
     listed = made.worst_first[:_NUM_LISTED]
+    rows = {record.name: _anchor("row", record) for record in (*listed, *left_out)}
     title = "All keys, worst first"
     if len(listed) < len(made.worst_first):
         title = f"The {len(listed):,} worst keys"
-    score_heads = ("score", "median", "5 to 95 % of keys", "limit", "usual on KITTI")
-    drive_heads = ("recording", "keys", "split", "cameras, px")
+    level, verdict = _verdict(made, {**rows, **cards})
+    score_heads = ("score", "median", _range_head(made), "usual on KITTI", "suspect keys")
+    message_heads = ("reason or warning", "keys", "for example")
     parts = {
-        "title": html.escape(root.resolve().name),
+        "title": f"Training set {html.escape(root.resolve().name)}",
         "state": _state(made, command),
-        "verdict": html.escape(_verdict(made)),
-        "scores": _table(score_heads, (_score_row(made, score) for score in _SCORES)),
-        "plots": "\n".join(_plot(score, made) for score in made.scores),
-        "keys": "\n".join(_card(made, record) for record in pictured),
+        "level": level,
+        "verdict": verdict,
+        "scores": _table(score_heads, (_score_row(made, series) for series in made.series)),
+        **_drive_tables(made, rows),
+        "messages": _table(message_heads, _message_rows(made, {**rows, **cards})),
+        "limits": _table(("with", "keys put aside"), _limit_rows(made)),
+        "suspects": html.escape("\n".join(f"{drive} {key}" for drive, key in made.suspects)),
+        "plots": "\n".join(_plot(made, score, rows) for score in SCORES),
+        "legend": _legend(made),
+        "worst": "\n".join(_card(made, record) for record in worst),
+        "spread": "\n".join(_card(made, record) for record in spread),
         "aside": "\n".join(_card(made, record) for record in aside),
-        "left_out": _key_table(made, left_out, with_card),
+        "left_out": _key_table(made, left_out, cards),
         "listed_title": title,
-        "listed": _key_table(made, listed, with_card),
+        "listed": _key_table(made, listed, cards),
         "recipe": html.escape(_recipe(made.table)),
-        "drives": _table(drive_heads, map(_drive_row, made.drives.values())),
+        "recordings": _table(("recording", "split", "cameras, px"), _drive_rows(made)),
         "settings": html.escape(yaml.safe_dump(made.table["config"], sort_keys=False)),
     }
     return fill_template("set.html", parts)
 
 
-def _chosen_for_pictures(worst_first: Sequence[KeyRecord]) -> list[KeyRecord]:
-    """Return the worst keys, then others that are spread evenly over the set."""
-    others = sorted(worst_first[_NUM_WORST:], key=lambda record: record.name)
+def _spread(made: JudgedSet, worst: Sequence[KeyRecord]) -> list[KeyRecord]:
+    """Return keys that are spread evenly over the set, without the ``worst`` ones."""
+    others = [r for r in made.records if r.status == "done" and r not in worst]
     rows = np.linspace(0, len(others) - 1, min(_NUM_SPREAD, len(others))).astype(int)
-    return [*worst_first[:_NUM_WORST], *(others[row] for row in rows)]
+    return [others[row] for row in rows]
 
 
-def _state(made: _Set, command: str) -> str:
+def _worst_aside(made: JudgedSet, left_out: Sequence[KeyRecord]) -> list[KeyRecord]:
+    """Return the keys put aside that have a picture, those with most ghosts first."""
+    ghosts = Series(SCORES[0], "")
+    with_picture = [record for record in left_out if record.files]
+    return sorted(with_picture, key=lambda r: -(ghosts.of(r) or 0))[:_NUM_ASIDE]
+
+
+def _state(made: JudgedSet, command: str) -> str:
     """Return how many keys the set has, what they cost, and how to make the others."""
     counts = Counter[str](record.status for record in made.records)
     words = {"done": "done", "aside": "put aside", "failed": "failed"}
@@ -209,52 +157,151 @@ def _state(made: _Set, command: str) -> str:
     rest = describe_rest(made.records, num_left)
     how = "run the command that made the set again, without --preview"
     how = f"<code>{html.escape(command)}</code>" if command else how
-    later = "Keys are compared with their neighbours when all are made."
+    later = (
+        "The finished set is checked once more: a key that is far worse than the keys around it "
+        "is put aside."
+    )
     return f"<b>{kind}: {num_tried}</b>; {rest}: {how}<br>{state}. {later}"
 
 
-def _verdict(made: _Set) -> str:
-    """Return sentences that say whether the set is as good as one of KITTI."""
+def _verdict(made: JudgedSet, targets: Mapping[Key, str]) -> tuple[str, str]:
+    """Return ``good``, ``look`` or ``bad``, and sentences as HTML that say why."""
     if not made.worst_first:
-        return "No key is done."
-    judged = [score for score in _SCORES if score.usual() and made.values(score)]
-    medians = {score.title.lower(): float(np.median(made.values(score))) for score in judged}
-    worse = [s.title.lower() for s in judged if s.is_worse_than_usual(medians[s.title.lower()])]
-    scanner = "KITTI drive 0013 (64 rings, front camera, moving vehicle)"
-    lines = [f"Good: {', '.join(medians)} are as usual on {scanner}."]
+        return "bad", "✗ No key is done."
+    num_done, errors = len(made.worst_first), [s for s in made.series if s.score.is_error]
+    errors = [series for series in errors if series.score.usual() and made.values(series)]
+    worse = [s for s in errors if np.median(made.values(s)) > s.score.usual()[1]]
+    level, lines = "good", [f"✓ Good: no key of {num_done:,} stands out."]
+    if made.suspects:
+        level = "look"
+        ordered = [r.name for r in made.worst_first if r.name in made.suspects]
+        named = ordered[:_NUM_NAMED]
+        links = [_suspect_link(made, name, targets) for name in named]
+        num_more = len(made.suspects) - len(named)
+        links += [f"and {num_more:,} more"] if num_more else []
+        noun = "key is" if num_done == 1 else "keys are"
+        count = f"{len(made.suspects):,} of {num_done:,} {noun} suspect"
+        lines = [f"! {count}: {', '.join(links)}."]
     if worse:
-        lines = [f"Worse than usual on {scanner}: {', '.join(worse)}. See the worst keys."]
-    if "held-out outliers" not in medians:
-        lines.append("Outliers are not measured: --set output.score=true does.")
-    num_beyond = sum(
-        any((v := s.of(record)) is not None and s.is_worse_than_usual(v) for s in judged)
-        for record in made.worst_first
-    )
-    if num_beyond:
-        lines.append(
-            f"{num_beyond:,} of {len(made.worst_first):,} keys are worse than usual there."
-        )
-    num_out = len(made.records) - len(made.worst_first)
+        level = "bad"
+        names = ", ".join(_title(series).lower() for series in worse)
+        lines.insert(0, f"✗ The median key is worse than usual on {_USUAL}: {html.escape(names)}.")
+    lines.append(_error_sentence(made))
+    num_out = len(made.records) - num_done
     if num_out > _MANY_ASIDE * len(made.records):
+        level = "look" if level == "good" else level
         lines.append(f"{num_out:,} of {len(made.records):,} keys were put aside or failed.")
-    return " ".join(lines)
+    return level, " ".join(lines)
 
 
-def _score_row(made: _Set, score: _Score) -> list[str]:
-    """Return the cells of a score: its median and range in the set, its limit, usual values."""
-    gate, unit, values = made.table["gate"], score.unit, made.values(score)
-    limits = []
-    if score.limit and gate[score.limit] is not None:
-        limits.append(f"{score.limit[:3]}. {_text(100.0 * gate[score.limit])} {unit}")
-    if score.limit in ("max_ghost", "max_outliers") and gate["max_ratio"] is not None:
-        floor = f"{score.usual()[1]:g} {unit}"
-        limits.append(f"{floor} and {gate['max_ratio']:g} × its neighbours' median")
-    median, span = "not computed", ""
+def _suspect_link(made: JudgedSet, name: Key, targets: Mapping[Key, str]) -> str:
+    """Return the link to a suspect key, with the reason, as HTML."""
+    drive, key = name
+    text = f"{drive}, key {key}" if len(made.drives) > 1 else f"key {key}"
+    reason = html.escape(made.suspects[name][0].reason())
+    target = targets.get(name, "")
+    return f"{_link(text, target and '#' + target)} ({reason})"
+
+
+def _error_sentence(made: JudgedSet) -> str:
+    """Return how large the errors are, and how to measure them if they are only expected."""
+    medians = {
+        name: [
+            f"{s.score.text(float(np.median(made.values(s))))} %"
+            + (f" ({html.escape(s.camera)})" if s.camera else "")
+            for s in made.series
+            if s.score.name == name and made.values(s)
+        ]
+        for name in ("outliers", "expected_outliers")
+    }
+    if medians["outliers"]:
+        return f"Outliers of the median key, held out: {', '.join(medians['outliers'])}."
+    expected = ", ".join(medians["expected_outliers"])
+    expected = f" By confidence, {expected} are expected." if expected else ""
+    return (
+        f"Outliers are not measured.{expected} A preview measures them: "
+        "<code>densify dataset … --out ANOTHER --preview 8</code>."
+    )
+
+
+def _title(series: Series) -> str:
+    return f"{series.score.title}, {series.camera}" if series.camera else series.score.title
+
+
+def _range_head(made: JudgedSet) -> str:
+    return "5 to 95 % of keys" if len(made.worst_first) >= _FEWEST_IN_RANGE else "range"
+
+
+def _score_row(made: JudgedSet, series: Series) -> list[str]:
+    """Return the cells of a score: its median and range in the set, usual values, suspects."""
+    score, values = series.score, made.values(series)
+    ends = (0.05, 0.95) if len(values) >= _FEWEST_IN_RANGE else (0.0, 1.0)
+    cells = ["", ""]
     if values:
-        low, middle, high = map(float, np.quantile(values, (0.05, 0.5, 0.95)))
-        median, span = f"{_text(middle)} {unit}", f"{_text(low)} to {_text(high)} {unit}"
-    usual = " to ".join(f"{end:g}" for end in score.usual())
-    return _cells([score.title, median, span, "; ".join(limits), usual and f"{usual} {unit}"])
+        low, middle, high = map(float, np.quantile(values, (ends[0], 0.5, ends[1])))
+        cells = [f"{score.text(middle)} {score.unit}", f"{score.text(low)} to {score.text(high)}"]
+    usual = score.usual()
+    text = (
+        ""
+        if not usual
+        else f"to {usual[1]:g}"
+        if score.is_error
+        else f"{usual[0]:g} to {usual[1]:g}"
+    )
+    suspect = sum(any(j.series == series for j in found) for found in made.suspects.values())
+    return [html.escape(cell) for cell in (_title(series), *cells, text)] + [
+        _marked(f"{suspect:,}", bool(suspect)) if usual else ""
+    ]
+
+
+def _marked(text: str, is_suspect: bool) -> str:
+    """Return a text as HTML, marked if it is that of a suspect key."""
+    return f'<b class="suspect">{text}</b>' if is_suspect else text
+
+
+def _drive_tables(made: JudgedSet, rows: Mapping[Key, str]) -> dict[str, str]:
+    """Return tables of the worst recordings and of the others, "" for a single recording."""
+    if len(made.drives) < 2:
+        return {"drives": "", "other_drives": ""}
+    scores, lines = made.scores, []
+    for drive in made.drives.values():
+        records = [record for record in made.records if record.drive == drive.name]
+        counts = Counter[str](record.status for record in records)
+        done = [record for record in made.worst_first if record.drive == drive.name]
+        num_suspect = sum(record.name in made.suspects for record in done)
+        target = rows.get(done[0].name, "") if done else ""
+        cells = [
+            _link(drive.name, target and "#" + target),
+            f"{len(drive.keys):,}",
+            *(f"{counts[status]:,}" for status in ("done", "aside", "failed")),
+            _marked(f"{num_suspect:,}", bool(num_suspect)),
+        ]
+        for score in scores:
+            known = [v for r in done if (v := made.worst_value(score, r)) is not None]
+            cells.append(score.text(float(np.median(known))) if known else "")
+        bad_share = (num_suspect + counts["aside"] + counts["failed"]) / max(len(records), 1)
+        lines.append((bad_share, cells))
+    lines.sort(key=lambda line: -line[0])
+    titles = (f"{score.title}, {score.unit}" for score in scores)
+    heads = ("recording", "keys", "done", "aside", "failed", "suspect", *titles)
+    ordered = [cells for _, cells in lines]
+    worst, others = ordered[:_NUM_DRIVES], ordered[_NUM_DRIVES:]
+    return {"drives": _table(heads, worst), "other_drives": _table(heads, others)}
+
+
+def _message_rows(made: JudgedSet, targets: Mapping[Key, str]) -> Iterator[list[str]]:
+    """Yield the cells of the reasons and warnings of the keys, the most frequent first."""
+    for text, records in count_messages(made.records)[:_NUM_MESSAGES]:
+        first = records[0]
+        target = targets.get(first.name, "")
+        link = _link(made.name_of(first), target and "#" + target)
+        yield [html.escape(text), f"{len(records):,}", link]
+
+
+def _limit_rows(made: JudgedSet) -> Iterator[list[str]]:
+    for limit in limits_of(made):
+        num = f"{limit.num_lost:,} of {len(made.worst_first):,}"
+        yield [f"<code>--set {limit.setting}</code>", num]
 
 
 def _recipe(table: Mapping[str, Any]) -> str:
@@ -272,79 +319,144 @@ def _recipe(table: Mapping[str, Any]) -> str:
     )
 
 
-def _drive_row(drive: Drive) -> list[str]:
-    cameras = (f"{c.name} {c.width_px} × {c.height_px}" for c in drive.cameras.values())
-    split = drive.folder.rpartition("/")[0]
-    return _cells([drive.name, f"{len(drive.keys):,}", split, ", ".join(cameras)])
+def _drive_rows(made: JudgedSet) -> Iterator[list[str]]:
+    for drive in made.drives.values():
+        cameras = (f"{c.name} {c.width_px} × {c.height_px}" for c in drive.cameras.values())
+        split = drive.folder.rpartition("/")[0]
+        yield [html.escape(text) for text in (drive.name, split, ", ".join(cameras))]
 
 
-def _plot(score: _Score, made: _Set) -> str:
-    """Return the values of a score over the frames as SVG."""
-    worst, half = made.worst_first, _NUM_DOTS // 2
+def _plot(made: JudgedSet, score: Score, rows: Mapping[Key, str]) -> str:
+    """Return the values of a score over the frames as SVG, "" if no key has the score."""
+    series_of_score = [series for series in made.series if series.score is score]
+    worst, half = made.worst_first, _NUM_DOTS // (2 * max(len(series_of_score), 1))
     shown = {record.name for record in (*worst[:half], *worst[half :: len(worst) // half + 1])}
-    dots = [
-        Dot(record.drive, record.key, value, record.status == "done", _anchor("row", record))
-        for record in made.records
-        if (record.status == "aside" or record.name in shown)
-        if (value := score.of(record)) is not None
-    ]
+    dots, values = [], []
+    for record in made.records:
+        if record.status == "done" and record.name not in shown:
+            continue
+        target, name = rows.get(record.name, ""), f"{record.drive}, key {record.key}"
+        if record.status == "failed":
+            dots.append(Dot(record.drive, record.key, None, "", f"{name}: failed", target))
+        for number, series in enumerate(series_of_score):
+            if (value := series.of(record)) is not None and record.status != "failed":
+                values.append(value)
+                is_suspect = any(j.series == series for j in made.suspects.get(record.name, ()))
+                hollow = "hollow" if record.status == "aside" else ""
+                style = f"camera-{number % 6} {hollow} {'suspect' if is_suspect else ''}"
+                text = f"{name} {series.camera}: {score.text(value)} {score.unit}"
+                dots.append(Dot(record.drive, record.key, value, style, text, target))
+    if not values:
+        return ""
     usual = score.usual()
-    if usual and score.is_bad > 0:
-        usual[0] = 0.0  # a lower value is no worse
-    return score_plot(score.title, score.unit, dots, usual)
+    lowest, highest = min(values + usual[:1]), max(values + usual[1:])
+    if score.is_bad > 0:  # a lower value is no worse
+        lowest, usual = 0.0, [0.0, *usual[1:]] if usual else []
+    share = made.table["gate"].get(score.limit)
+    limit = None if share is None else 100 * share
+    return score_plot(Axis(f"{score.title}, {score.unit}", lowest, highest, usual, limit), dots)
+
+
+def _legend(made: JudgedSet) -> str:
+    """Return what the marks of the plots mean as HTML, for the marks that they have."""
+    names = sorted({series.camera for series in made.series if series.camera})
+    dots = [
+        f'<svg class="mark" viewBox="0 0 8 8"><circle cx="4" cy="4" r="3" class="camera-{n % 6}"/>'
+        f"</svg>&nbsp;{html.escape(name)}"
+        for n, name in enumerate(names)
+        if len(names) > 1
+    ]
+    statuses, gate = {record.status for record in made.records}, made.table["gate"]
+    marks = {
+        f"Cameras: {', '.join(dots)}.": bool(dots),
+        "Ringed in red: suspect.": bool(made.suspects),
+        "Hollow: put aside.": "aside" in statuses,
+        "Cross: failed.": "failed" in statuses,
+        "Band: usual on KITTI.": True,
+        "Dashed: limit of the set.": any(gate[s.limit] is not None for s in SCORES if s.limit),
+        "At the left: histogram.": len(made.records) >= FEWEST_IN_HISTOGRAM,
+    }
+    return " ".join(text for text, is_used in marks.items() if is_used)
 
 
 def _anchor(kind: str, record: KeyRecord) -> str:
     return f"{kind}-{quote(record.drive)}-{record.key}"
 
 
-def _card(made: _Set, record: KeyRecord) -> str:
-    """Return the pictures of a key with its scores, and a link to its own page."""
-    name, pictures, texts = made.name_of(record), "", []
+def _card(made: JudgedSet, record: KeyRecord) -> str:
+    """Return the pictures of a key with its scores, and a link to its own page or its command."""
+    name, camera, pictures = made.name_of(record), _worst_camera(made, record), ""
     try:
-        for picture in _pictures(made, record, name):
+        for picture in _pictures(made, record, camera, name):
             pictures += picture
     except (InputError, OSError) as error:
         pictures += f"<p>{html.escape(str(error))}</p>"
-    worst = made.worst_score.get(record.name)
-    for score in sorted(made.scores, key=lambda score: score.name != worst):  # the worst one first
-        if (value := score.of(record)) is not None:
-            text = f"{score.title.lower()} {_text(value)} {score.unit}".replace(" ", "&nbsp;")
-            texts.append(made.marked(record, score, text))
-    remarks = "; ".join(filter(None, [record.reason, *record.warnings]))
+    suspect = made.suspects.get(record.name, ())
+    why = "; ".join(judgement.reason() for judgement in suspect)
+    texts = []
+    for series in made.series:
+        value = series.of(record) if series.camera in ("", camera) else None
+        if value is not None:
+            text = f"{series.score.title.lower()} {series.score.text(value)} {series.score.unit}"
+            is_suspect = any(judgement.series == series for judgement in suspect)
+            texts.append(_marked(html.escape(text).replace(" ", "&nbsp;"), is_suspect))
+    remarks = "; ".join(filter(None, [why, record.reason, *record.warnings]))
+    files = ", ".join(
+        f'<a href="{quote(path)}">{kind}</a>'
+        for kind, kinds in (
+            ("measured", _MEASURED),
+            ("filled", FILLED),
+            ("confidence", ("confidence",)),
+        )
+        if (path := find_map(record, kinds, camera))
+    )
+    files = f"<br>Files: {files}" if files else ""
     return (
         f'<figure id="{_anchor("card", record)}"><figcaption>'
-        f"{_link(name, _own_page(record) or '#' + _anchor('row', record))}<br>"
-        f"{', '.join(texts)}</figcaption>{pictures}"
-        f"<figcaption>{html.escape(remarks)}</figcaption></figure>"
+        f"{_link(name, _own_page(record))}, {html.escape(camera)}<br>{', '.join(texts)}"
+        f'</figcaption><label><input type="checkbox">{pictures}</label>'
+        f"<figcaption>{html.escape(remarks)}{files}{_page_command(made, record)}"
+        "</figcaption></figure>"
     )
 
 
-def _pictures(made: _Set, record: KeyRecord, name: str) -> Iterator[str]:
-    """Yield the image, the filled depth and the confidence of a key as HTML, if it has them.
+def _worst_camera(made: JudgedSet, record: KeyRecord) -> str:
+    """Return the name of the camera of a key's worst score, or of the front camera."""
+    worst = made.worst.get(record.name)
+    return (worst.series.camera if worst else "") or front_camera(made.drives[record.drive])
 
-    The camera is that of the key's worst score, or the front camera.
-    """
-    drive = made.drives[record.drive]
-    worst = {score.name: score for score in _SCORES}.get(made.worst_score.get(record.name, ""))
-    camera = (worst and worst.camera_of(record)) or front_camera(drive)
-    depth = find_map(record, FILLED, camera)
-    confidence = find_map(record, ("confidence",), camera)
+
+def _page_command(made: JudgedSet, record: KeyRecord) -> str:
+    """Return the command that makes the page of a key as HTML, "" if the key has one."""
+    if _own_page(record).endswith("report.html"):
+        return ""
+    data, window = made.drives[record.drive].data, made.table["window"]
+    words = ["densify", "run", data, "--key", str(record.key), "--window", str(window), "--report"]
+    command = html.escape(shlex.join(words))
+    return f"<details><summary>Command for its own page</summary><code>{command}</code></details>"
+
+
+def _pictures(made: JudgedSet, record: KeyRecord, camera: str, name: str) -> Iterator[str]:
+    """Yield the image, the two depth maps and the confidence of a key as HTML, if it has them."""
+    drive, image = made.drives[record.drive], None
     kept = next((n for n in record.files if n.startswith(f"{_ASIDE}/")), None)
-    if depth is not None:
+    for title, kinds in (("measured depth", _MEASURED), ("filled depth", FILLED)):
+        if (depth := find_map(record, kinds, camera)) is None:
+            continue
         small_m = metres(_shrink(read_stored(made.root / depth, np.uint16, "a depth map")))
-        image = _small_image(drive, camera, record.key, small_m.shape[::-1])
-        if image is not None:
-            yield _image(image, f"image {camera}, {name}")
-        yield _image(_draw_depth(small_m, image), f"filled depth {camera}, {name}")
-    elif kept is not None:
+        if image is None:
+            image = _small_image(drive, camera, record.key, small_m.shape[::-1])
+            if image is not None:
+                yield _image(image, f"image {camera}, {name}")
+        yield _image(_draw_depth(small_m, image), f"{title} {camera}, {name}")
+    if kept is not None:
         yield _embedded((made.root / kept).read_bytes(), f"filled depth, {name}")
-    if confidence is not None:
+    if (confidence := find_map(record, ("confidence",), camera)) is not None:
         stored = _shrink(read_stored(made.root / confidence, np.uint8, "a map of confidence"))
-        # Black without depth, white at confidence 1
-        gray = _LEAST_GRAY + (stored - 1.0) * (255 - _LEAST_GRAY) / 254
-        gray = np.where(stored > 0, gray, 0).astype(np.uint8)
-        yield _image(np.repeat(gray[:, :, None], 3, axis=2), f"confidence, {name}")
+        values = (stored - 1.0) / 254
+        gray = np.interp(values, _CONFIDENCE, _GRAY)[:, :, None]
+        picture = np.where(stored[:, :, None] > 0, gray, _NO_DEPTH_RGB).astype(np.uint8)
+        yield _image(np.ascontiguousarray(picture), f"confidence, {name}")
 
 
 def _own_page(record: KeyRecord) -> str:
@@ -367,40 +479,41 @@ def _embedded(jpeg: bytes, alt: str) -> str:
     return f'<img alt="{html.escape(alt)}" src="data:image/jpeg;base64,{data}">'
 
 
-def _key_table(made: _Set, records: Sequence[KeyRecord], with_card: set[Key]) -> str:
-    """Return a table of keys: name, scores, status if not done, and warnings."""
-    rows = []
+def _key_table(made: JudgedSet, records: Sequence[KeyRecord], cards: Mapping[Key, str]) -> str:
+    """Return a table of keys: name, scores of the worst camera, and remarks in a row below."""
+    rows, attributes = [], []
     for record in records:
-        target = f"#{_anchor('card', record)}" if record.name in with_card else _own_page(record)
-        values = [made.marked(record, score, _text(score.of(record))) for score in made.scores]
+        target = cards.get(record.name)
+        cells = [_link(made.name_of(record), f"#{target}" if target else _own_page(record))]
+        for score in made.scores:
+            text = score.text(made.worst_value(score, record))
+            cells.append(_marked(text, made.is_suspect_in(score, record)))
+        rows.append(cells)
+        attributes.append(f' id="{_anchor("row", record)}"')
         status = "" if record.status == "done" else f"{record.status}: {record.reason}"
-        remarks = html.escape("; ".join(filter(None, [status, *record.warnings])))
-        rows.append([_link(made.name_of(record), target), *values, remarks])
-    heads = ["key", *(f"{score.title}, {score.unit}" for score in made.scores), "remarks"]
-    return _table(heads, rows, [f' id="{_anchor("row", record)}"' for record in records])
-
-
-def _cells(values: Iterable[Any]) -> list[str]:
-    return [html.escape(_text(value)) for value in values]
+        if remarks := "; ".join(filter(None, [status, *record.warnings])):
+            rows.append([html.escape(remarks)])
+            attributes.append(' class="remark"')
+    heads = ["key", *(f"{score.title}, {score.unit}" for score in made.scores)]
+    return _table(heads, rows, attributes)
 
 
 def _table(
     heads: Iterable[str], rows: Iterable[Iterable[str]], attributes: Iterable[str] = repeat("")
 ) -> str:
-    """Return the rows of a table, whose cells are HTML, with its head; "" without rows."""
-    body = [
-        f"<tr{attribute}>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>"
-        for row, attribute in zip(rows, attributes, strict=False)
-    ]
+    """Return the rows of a table, whose cells are HTML, with its head; "" without rows.
+
+    The last cell of a short row reaches over the columns that the row lacks.
+    """
+    heads, body = list(heads), []
+    for row, attribute in zip(rows, attributes, strict=False):
+        *cells, last = row
+        span = len(heads) - len(cells)
+        reach = f' colspan="{span}"' if span > 1 else ""
+        texts = "".join(f"<td>{cell}</td>" for cell in cells)
+        body.append(f"<tr{attribute}>{texts}<td{reach}>{last}</td></tr>")
     head = "".join(f"<th>{html.escape(name)}</th>" for name in heads)
     return "\n".join([f"<tr>{head}</tr>", *body]) if body else ""
-
-
-def _text(value: Any) -> str:
-    """Return a value as people read it: floats with two or three digits."""
-    if isinstance(value, float):
-        return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2g}"
-    return "" if value is None else str(value)
 
 
 # Pictures of a key
@@ -450,6 +563,11 @@ def _draw_depth(depth_m: Float32, image: Picture | None) -> Picture:
     return np.ascontiguousarray(depth_over_image(below, depth_m)[:, :, ::-1])
 
 
+def kept_picture(out: Path, drive: Drive, key: int) -> Path:
+    """Return the path of the picture of a key that is put aside."""
+    return out / _ASIDE / drive.name / f"{key:010d}.jpg"
+
+
 def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> Path:
     """Write the picture of a key whose maps are not kept, and return its path.
 
@@ -462,7 +580,7 @@ def keep_picture(out: Path, drive: Drive, key: int, filled_m: Float32) -> Path:
     small_m = _shrink(filled_m)
     image = _small_image(drive, front_camera(drive), key, small_m.shape[::-1])
     picture = _draw_depth(small_m, image)
-    path = out / _ASIDE / drive.name / f"{key:010d}.jpg"
+    path = kept_picture(out, drive, key)
     write_file(path, encode_jpeg(picture, _QUALITY))
     return path
 

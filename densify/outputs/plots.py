@@ -6,7 +6,7 @@ from __future__ import annotations
 import html
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -39,9 +39,10 @@ _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
 _AXES_INCH = (8.6, 4.8)
 # An SVG of a score: a histogram at the left, dots at the right, frame numbers below.
 _PLOT_PX, _PLOT_TOP_PX, _PLOT_BASE_PX = (400, 160), 26, 138
-_LABELS_PX, _HISTOGRAM_PX, _GAP_PX = 40, 60, 6
-_FEWEST_IN_HISTOGRAM, _NUM_BINS, _LEAST_LABEL_PX = 20, 20, 70
-_AXIS_ENDS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # times a power of ten
+_LABELS_PX, _HISTOGRAM_PX, _GAP_PX = 30, 60, 8
+_NUM_BINS, _LEAST_LABEL_PX, _NUM_TICKS = 20, 90, 3
+FEWEST_IN_HISTOGRAM = 10
+"""Number of keys from which a plot has a histogram."""
 _FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
 _MIN_TRAVEL_M = 1.0
 """A shorter way may be noise of the registration, of a vehicle at rest."""
@@ -172,74 +173,114 @@ class Dot(NamedTuple):
 
     recording: str
     frame: int
-    value: float
-    is_kept: bool  # False draws a hollow dot
-    target: str  # identifier of the element of the page that the dot leads to
+    value: float | None  # None draws a cross below, for a key that failed
+    style: str  # names of the style sheet, such as "hollow" or "suspect"
+    text: str  # shown under the pointer
+    target: str  # identifier of the element of the page that the dot leads to, "" for none
 
 
-def score_plot(title: str, unit: str, dots: Sequence[Dot], usual: Sequence[float] = ()) -> str:
-    """Return SVG with a score over the frame numbers of each recording, from 20 keys a histogram.
+class Axis(NamedTuple):
+    """The values of a score that a plot shows, and what is drawn behind its dots."""
+
+    title: str
+    lowest: float
+    highest: float
+    usual: Sequence[float] = ()  # lowest and highest usual value, drawn as a band
+    limit: float | None = None  # drawn as a dashed line
+
+    def ticks(self) -> list[float]:
+        """Return round values that enclose the shown ones."""
+        room = max(self.highest - self.lowest, 1e-9) / _NUM_TICKS
+        power = 10.0 ** np.floor(np.log10(room))
+        step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= 0.999 * room)
+        first, last = np.floor(self.lowest / step + 1e-6), np.ceil(self.highest / step - 1e-6)
+        return [float(round(step * row, 9)) for row in np.arange(first, max(last, first + 1) + 1)]
+
+
+def score_plot(axis: Axis, dots: Sequence[Dot]) -> str:
+    """Return SVG with a score over the frame numbers of each recording, from 10 keys a histogram.
 
     Args:
-        title: Name of the score.
-        unit: Unit of its values.
+        axis: The score and its values.
         dots: The keys, ordered by recording and frame.
-        usual: Lowest and highest usual value, drawn as a band; empty for none.
     """
-    largest = max((dot.value for dot in dots), default=0.0) or 1.0
-    power = 10.0 ** np.floor(np.log10(largest))
-    end = next(power * factor for factor in _AXIS_ENDS if power * factor >= 0.999 * largest)
-    scale_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / end  # per unit of the score
-    (width_px, height_px), left_px = _PLOT_PX, _LABELS_PX
-    parts = [f'<text x="{left_px}" y="14" class="title">{html.escape(title)}, {unit}</text>']
-    if usual:
-        top, bottom = (_PLOT_BASE_PX - min(value, end) * scale_px for value in reversed(usual))
+    ticks, (width_px, height_px) = axis.ticks(), _PLOT_PX
+    scale_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / (ticks[-1] - ticks[0])  # per unit of the score
+
+    def height(value: float) -> float:
+        """Return the y of a value, within the plot."""
+        return _PLOT_BASE_PX - (min(max(value, ticks[0]), ticks[-1]) - ticks[0]) * scale_px
+
+    parts = [f'<text x="0" y="14" class="title">{html.escape(axis.title)}</text>']
+    values = [dot.value for dot in dots if dot.value is not None]
+    left_px = float(_LABELS_PX)
+    if len(values) >= FEWEST_IN_HISTOGRAM:
+        parts += _draw_histogram(values, (ticks[0], ticks[-1]))
+        left_px += _HISTOGRAM_PX
+    if axis.usual:
+        top, bottom = (height(value) for value in reversed(axis.usual))
         parts.append(
             f'<rect x="{left_px}" y="{top:.1f}" width="{width_px - left_px}" '
             f'height="{bottom - top:.1f}" class="usual"><title>usual on KITTI</title></rect>'
         )
-    for tick in (0.0, end / 2, end):
-        y = _PLOT_BASE_PX - tick * scale_px
-        parts.append(f'<path d="M{left_px} {y:.1f}H{width_px}"/>')
-        parts.append(f'<text x="{left_px - 4}" y="{y + 4:.1f}" class="end">{tick:g}</text>')
-    if len(dots) >= _FEWEST_IN_HISTOGRAM:
-        counts = np.histogram([dot.value for dot in dots], _NUM_BINS, (0, end))[0]
-        bar_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / _NUM_BINS
-        parts += [
-            f'<rect x="{left_px}" y="{_PLOT_BASE_PX - (row + 1) * bar_px:.1f}" height="'
-            f'{bar_px - 1:.1f}" width="{_HISTOGRAM_PX * num / counts.max():.1f}"/>'
-            for row, num in enumerate(counts)
-        ]
-        left_px += _HISTOGRAM_PX
-    parts += _draw_dots(dots, left_px + _GAP_PX, unit, scale_px)
-    label = html.escape(f"{title} of each key over its frame number")
+    for tick in ticks:
+        parts.append(f'<path d="M{_LABELS_PX} {height(tick):.1f}H{width_px}"/>')
+        text = f'<text x="{_LABELS_PX - 4}" y="{height(tick) + 4:.1f}" class="end">'
+        parts.append(f"{text}{tick:g}</text>")
+    if axis.limit is not None and ticks[0] <= axis.limit <= ticks[-1]:
+        parts.append(f'<path class="limit" d="M{left_px} {height(axis.limit):.1f}H{width_px}"/>')
+    parts += _draw_dots(dots, left_px, height)
+    label = html.escape(f"{axis.title} of each key over its frame number")
     size = f"0 0 {width_px} {height_px}"
     return f'<svg viewBox="{size}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
 
 
-def _draw_dots(dots: Sequence[Dot], left_px: float, unit: str, scale_px: float) -> list[str]:
-    """Return the dots of all recordings side by side, with the first and last frame of each."""
+def _draw_histogram(values: Sequence[float], ends: tuple[float, float]) -> list[str]:
+    """Return the bars of a histogram, which lie one above the other."""
+    counts = np.histogram(values, _NUM_BINS, ends)[0]
+    bar_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / _NUM_BINS
+    return [
+        f'<rect x="{_LABELS_PX}" y="{_PLOT_BASE_PX - (row + 1) * bar_px:.1f}" class="bar" '
+        f'height="{bar_px - 1:.1f}" width="{(_HISTOGRAM_PX - 8) * num / counts.max():.1f}">'
+        f"<title>{num:,}</title></rect>"
+        for row, num in enumerate(counts)
+        if num
+    ]
+
+
+def _draw_dots(dots: Sequence[Dot], left_px: float, height: Callable[[float], float]) -> list[str]:
+    """Return the dots of all recordings side by side, every second one on a shaded ground."""
     groups = [list(group) for _, group in groupby(dots, key=lambda dot: dot.recording)]
     spans = [max(1, group[-1].frame - group[0].frame) for group in groups]
-    room_px = _PLOT_PX[0] - left_px - _GAP_PX * (2 * len(groups) - 1)
-    frame_px = max(room_px, 1) / max(sum(spans), 1)
+    room_px = _PLOT_PX[0] - left_px
+    margin_px = min(_GAP_PX, room_px / (4 * max(len(groups), 1)))  # at both sides of a recording
+    frame_px = (room_px - 2 * margin_px * len(groups)) / max(sum(spans), 1)
     parts = []
-    for group, span in zip(groups, spans, strict=True):
-        first, last = group[0].frame, group[-1].frame
-        for dot in group:
-            x, y = left_px + (dot.frame - first) * frame_px, _PLOT_BASE_PX - dot.value * scale_px
-            hollow = "" if dot.is_kept else ' class="hollow"'
-            text = html.escape(f"{dot.recording}, key {dot.frame}: {dot.value:.3g} {unit}")
+    for number, (group, span) in enumerate(zip(groups, spans, strict=True)):
+        lane_px, first, last = span * frame_px + 2 * margin_px, group[0].frame, group[-1].frame
+        if number % 2:
             parts.append(
-                f'<a href="#{html.escape(dot.target)}"><circle cx="{x:.1f}" cy="{y:.1f}" r="3"'
-                f"{hollow}><title>{text}</title></circle></a>"
+                f'<rect class="lane" x="{left_px:.1f}" y="{_PLOT_TOP_PX}" width="{lane_px:.1f}" '
+                f'height="{_PLOT_BASE_PX - _PLOT_TOP_PX}"/>'
             )
-        end_px = left_px + span * frame_px
-        if span * frame_px >= _LEAST_LABEL_PX:
-            parts.append(f'<text x="{left_px:.1f}" y="154">frame {first}</text>')
+        for dot in group:
+            x = left_px + margin_px + (dot.frame - first) * frame_px
+            parts.append(_draw_dot(dot, x, None if dot.value is None else height(dot.value)))
+        if lane_px >= _LEAST_LABEL_PX:
+            parts.append(f'<text x="{left_px + margin_px:.1f}" y="154">frame {first}</text>')
+            end_px = left_px + lane_px - margin_px
             parts.append(f'<text x="{end_px:.1f}" y="154" class="end">{last}</text>')
-        left_px = end_px + 2 * _GAP_PX
+        left_px += lane_px
     return parts
+
+
+def _draw_dot(dot: Dot, x: float, y: float | None) -> str:
+    if y is None:
+        shape = f'<path class="failed" d="M{x - 3:.1f} {_PLOT_BASE_PX + 1}l6 6m0 -6l-6 6"/>'
+    else:
+        shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" class="{html.escape(dot.style)}"/>'
+    mark = f"<g>{shape}<title>{html.escape(dot.text)}</title></g>"
+    return f'<a href="#{html.escape(dot.target)}">{mark}</a>' if dot.target else mark
 
 
 def write_curve(result: Result, folder: Path) -> None:

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: MIT
+"""Judge the keys of a training set by their scores: the worst keys, suspects, costs of limits.
+
+A key is as bad as its worst score. Scores compare by their distance from the median of the set, in
+widths of the range that is usual on KITTI. A key is suspect if its errors exceed what is usual, or
+if it lacks more of the coverage that its camera has elsewhere in the set than is usual. Coverage
+itself depends on scanner, camera and speed, and has no range that all sets should reach.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from densify.dataset.manifest import USUAL_SHARES, Key, KeyRecord, read_manifests
+from densify.dataset.plan import Drive, drives_of, read_plan
+
+_SHARES_LOST = (0.0, 0.05, 0.1)  # of the keys, by the limits whose cost is told; at least one key
+_NUMBER = re.compile(r"\d[\d.,:/-]*")
+
+
+class Score(NamedTuple):
+    """A score of a key."""
+
+    name: str  # name in a manifest line
+    title: str
+    is_bad: int  # 1 if a high value is bad, -1 if a low value is
+    is_error: bool  # False if only the distance from the other keys counts
+    limit: str = ""  # name of the limit in the recipe
+    unit: str = "%"
+    num_digits: int = 2
+
+    def text(self, value: float | None) -> str:
+        """Return a value without its unit, "" if unknown."""
+        return "" if value is None else f"{value:.{self.num_digits}f}"
+
+    def usual(self) -> list[float]:
+        """Return the ends of the range on KITTI in ``unit``, [] if unknown."""
+        return [100 * share for share in USUAL_SHARES.get(self.name, ())]
+
+
+SCORES = (
+    Score("ghost", "Ghosts", 1, True, "max_ghost"),
+    Score("outliers", "Held-out outliers", 1, True, "max_outliers"),
+    Score("expected_outliers", "Expected outliers", 1, True),
+    Score("density", "Measured depth", -1, False, "min_density", num_digits=1),
+    Score("density_filled", "Filled depth", -1, False, num_digits=1),
+    Score("seconds", "Computing time", 1, False, unit="s", num_digits=1),
+)
+
+
+class Series(NamedTuple):
+    """A score of one camera, or of all of a key."""
+
+    score: Score
+    camera: str  # "" for a score that has no cameras
+
+    def of(self, record: KeyRecord) -> float | None:
+        """Return the score of a key in the score's unit, of the worst image; None if unknown."""
+        if self.score.name == "seconds":
+            return record.seconds
+        value = record.scores.get(self.score.name)
+        values = value if isinstance(value, Mapping) else {"": value}
+        known = [
+            100 * share
+            for name, share in values.items()
+            if share is not None and name.partition("/")[0] == self.camera
+        ]
+        return max(known, key=lambda percent: self.score.is_bad * percent, default=None)
+
+
+class Judgement(NamedTuple):
+    """How bad a score of a key is, compared with the other keys of the set."""
+
+    distance: float  # from the median of the set, in widths of the usual range
+    series: Series
+    value: float
+    median: float
+    is_suspect: bool
+
+    def reason(self) -> str:
+        """Return why the key is suspect or the worst, as text."""
+        score = self.series.score
+        camera = f" of {self.series.camera}" if self.series.camera else ""
+        text = f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}"
+        if score.is_error:
+            return f"{text}, usual up to {score.usual()[1]:g} {score.unit}"
+        return f"{text}, median {score.text(self.median)} {score.unit}"
+
+
+class Limit(NamedTuple):
+    """A limit of a training set, and the keys that it puts aside."""
+
+    setting: str
+    num_lost: int
+
+
+class JudgedSet(NamedTuple):
+    """The keys of a training set with their judgements."""
+
+    root: Path
+    table: Mapping[str, Any]  # content of dataset.json
+    drives: Mapping[str, Drive]
+    records: Sequence[KeyRecord]  # ordered by recording and frame
+    worst_first: Sequence[KeyRecord]  # the keys that are done
+    worst: Mapping[Key, Judgement]  # the worst score of each key that is done
+    suspects: Mapping[Key, Sequence[Judgement]]  # suspect scores of the suspect keys alone
+    series: Sequence[Series]  # the scores that a key of the set has, by camera
+
+    @property
+    def scores(self) -> list[Score]:
+        """The scores that a key of the set has."""
+        return [score for score in SCORES if any(s.score is score for s in self.series)]
+
+    def values(self, series: Series) -> list[float]:
+        """Return the known values of the keys that are done."""
+        return [value for record in self.worst_first if (value := series.of(record)) is not None]
+
+    def name_of(self, record: KeyRecord) -> str:
+        """Return a key's name, with the recording if there are several."""
+        return f"{record.drive}, key {record.key}" if len(self.drives) > 1 else f"key {record.key}"
+
+    def worst_value(self, score: Score, record: KeyRecord) -> float | None:
+        """Return a score of the key's worst camera, None if unknown."""
+        values = [series.of(record) for series in self.series if series.score is score]
+        known = [value for value in values if value is not None]
+        return max(known, key=lambda value: score.is_bad * value, default=None)
+
+    def is_suspect_in(self, score: Score, record: KeyRecord) -> bool:
+        """Return True if the score makes the key suspect, of any camera."""
+        return any(j.series.score is score for j in self.suspects.get(record.name, ()))
+
+    def worst_moments(self, num_keys: int) -> list[KeyRecord]:
+        """Return at most this number of the worst keys, one of those that share half a window."""
+        chosen: list[KeyRecord] = []
+        reach = self.table["window"]
+        for record in self.worst_first:
+            if len(chosen) == num_keys:
+                break
+            if not any(
+                r.drive == record.drive and abs(r.key - record.key) <= reach for r in chosen
+            ):
+                chosen.append(record)
+        return chosen
+
+
+def read_judged(root: Path) -> JudgedSet:
+    """Read the plan and the manifests of a training set, and judge its keys."""
+    table = read_plan(root) or {}
+    drives = drives_of(table)
+    records = [record for record in read_manifests(root).values() if record.drive in drives]
+    done = [record for record in records if record.status == "done"]
+    names = {series for record in records for series in _series_of(record)}
+    order = {score.name: row for row, score in enumerate(SCORES)}
+    series = sorted(names, key=lambda s: (order[s.score.name], s.camera))
+    judgements: dict[Key, list[Judgement]] = {record.name: [] for record in done}
+    for one in (s for s in series if s.score.usual()):
+        for name, judgement in _judge(one, done).items():
+            judgements[name].append(judgement)
+    worst = {name: max(all_, key=_badness) for name, all_ in judgements.items() if all_}
+    suspects = {
+        name: [j for j in sorted(all_, key=_badness, reverse=True) if j.is_suspect]
+        for name, all_ in judgements.items()
+    }
+
+    def badness(record: KeyRecord) -> tuple[bool, float]:
+        return _badness(worst[record.name]) if record.name in worst else (False, -np.inf)
+
+    return JudgedSet(
+        root,
+        table,
+        drives,
+        records,
+        sorted(done, key=badness, reverse=True),
+        worst,
+        {name: found for name, found in suspects.items() if found},
+        series,
+    )
+
+
+def _series_of(record: KeyRecord) -> Iterable[Series]:
+    """Return the scores that a key has, by camera."""
+    for score in SCORES:
+        value = record.seconds if score.name == "seconds" else record.scores.get(score.name)
+        values = value if isinstance(value, Mapping) else {"": value}
+        yield from (
+            Series(score, name.partition("/")[0])
+            for name, share in values.items()
+            if share is not None
+        )
+
+
+def _judge(series: Series, done: Sequence[KeyRecord]) -> dict[Key, Judgement]:
+    """Return the judgement of one score for each key that has it."""
+    score = series.score
+    low, high = score.usual()
+    values = {r.name: value for r in done if (value := series.of(r)) is not None}
+    median = float(np.median([*values.values()])) if values else 0.0
+    judged = {}
+    for name, value in values.items():
+        distance = score.is_bad * (value - median) / (high - low)
+        is_suspect = value > high if score.is_error else distance > 1
+        judged[name] = Judgement(distance, series, value, median, is_suspect)
+    return judged
+
+
+def _badness(judgement: Judgement) -> tuple[bool, float]:
+    return judgement.is_suspect, judgement.distance
+
+
+def limits_of(judged: JudgedSet) -> list[Limit]:
+    """Return limits that put one key, about 5 and about 10 % of the keys aside."""
+    limits = {}
+    for score in (score for score in SCORES if score.limit):
+        known = (judged.worst_value(score, record) for record in judged.worst_first)
+        values = sorted(score.is_bad * value for value in known if value is not None)
+        for share in _SHARES_LOST:
+            num_wanted = max(1, round(share * len(values)))
+            if num_wanted >= len(values):
+                continue
+            kept = values[-1 - num_wanted]  # the worst value within the limit
+            step = 10.0 ** (np.floor(np.log10(max(abs(kept), 1e-9))) - 1)  # of two digits
+            bound = float(np.ceil(kept / step - 1e-9) * step)
+            num_lost = sum(value > bound for value in values)
+            if num_lost:
+                setting = f"dataset.{score.limit}={abs(bound) / 100:.4g}"
+                limits[setting] = Limit(setting, num_lost)
+    return list(limits.values())
+
+
+def count_messages(records: Iterable[KeyRecord]) -> list[tuple[str, list[KeyRecord]]]:
+    """Return (message, keys) for the reasons and warnings, the most frequent first.
+
+    Messages that differ in their numbers alone count as one, and the first of them is returned.
+    """
+    groups: dict[str, tuple[str, list[KeyRecord]]] = {}
+    for record in records:
+        status = "" if record.status == "done" else f"{record.status}: {record.reason}"
+        for text in filter(None, [status, *record.warnings]):
+            groups.setdefault(_NUMBER.sub("#", text), (text, []))[1].append(record)
+    return sorted(groups.values(), key=lambda group: -len(group[1]))
