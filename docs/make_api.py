@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import html
 import inspect
 import re
 from collections.abc import Iterator, Mapping
@@ -71,6 +72,12 @@ def api() -> str:
     return "\n" + "\n\n".join(blocks) + "\n"
 
 
+def code(text: str) -> str:
+    """Return a text as code of a table, where GitHub and mkdocs agree on no other form of a bar."""
+    escaped = html.escape(text, quote=False).replace("|", "&#124;")
+    return f"<code>{escaped}</code>" if "|" in text else f"`{text}`"
+
+
 def parse_docstring(docstring: str) -> Doc:
     """Return the parts of a docstring in Google's style, in Markdown."""
     rows: dict[str, dict[str, str]] = {}
@@ -137,8 +144,8 @@ def _table(title: str, rows: Mapping[str, str], types: Mapping[str, str]) -> str
     lines = [f"| {title} | type | meaning |" if types else f"| {title} | meaning |"]
     lines.append("|---|---|---|" if types else "|---|---|")
     for name, meaning in rows.items():
-        cells = [f"`{name}`", *([f"`{types[name]}`"] if types else []), meaning]
-        lines.append("| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |")
+        cells = [code(name), *([code(types[name])] if types else []), meaning.replace("|", r"\|")]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

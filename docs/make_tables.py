@@ -164,7 +164,7 @@ def gains(networks: Any) -> str:
                 ours = of_kinds["densify measured"][test][part][0]
                 cells.append(f"{100 * (1 - ours / others):.0f} %")
         rows.append([kind, *cells])
-    return table(["fewer outliers than with", *training_titles(networks)], rows)
+    return table(["instead of", *training_titles(networks)], rows)
 
 
 def other_training(networks: Any) -> str:
@@ -318,13 +318,13 @@ def row_of(action: argparse.Action) -> tuple[str, str]:
 
 def coded(rows: Sequence[tuple[str, str]]) -> list[list[str]]:
     """Return rows of a table with the option as code."""
-    return [[f"`{usage}`", meaning] for usage, meaning in rows]
+    return [[make_api.code(usage), meaning] for usage, meaning in rows]
 
 
 def plain(text: str | None) -> str:
     """Return a text without marks of Markdown, and without the folder of the installed settings."""
     text = re.sub(r"\S+/(default\.yaml)", r"configs/\1", text or "")
-    return re.sub(r"[|*<\[\]]", r"\\\g<0>", text)
+    return re.sub(r"[|*\[\]]", r"\\\g<0>", text).replace("<", "&lt;")
 
 
 def spelled(action: argparse.Action) -> str:
@@ -332,7 +332,7 @@ def spelled(action: argparse.Action) -> str:
     value = "{" + ",".join(map(str, action.choices)) + "}" if action.choices else action.metavar
     value = "" if action.nargs == 0 else str(value or action.dest.upper())
     value += " …" if action.nargs in ("+", "*") else ""
-    return " ".join(filter(None, [*action.option_strings, value])).replace("|", "\\|")
+    return " ".join(filter(None, [*action.option_strings, value]))
 
 
 def settings() -> str:
