@@ -6,7 +6,8 @@ python docs/make_tables.py [FILE]
 FILE, printed by ``densify bench baselines --json`` or ``densify bench training --json``, replaces
 errors in docs/numbers.json. Costs are entered there by hand. ``densify bench gate --write`` writes
 tests/gate.json. A table stands between ``<!-- table: NAME -->`` and ``<!-- end -->``. Prose quotes
-a figure as a link to its table.
+a figure as a link to its table. The commands, the settings and the Python API are made in the same
+way, from the code.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ import json
 import math
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import make_api
 
 from densify.bench import gate
 from densify.bench.training import mean_and_error
@@ -150,6 +154,19 @@ def trained(networks: Any) -> str:
     return table(["outliers in %, trained on", *titles], rows)
 
 
+def gains(networks: Any) -> str:
+    """Return by how much fewer the outliers after training on densify's measured maps are."""
+    of_kinds, rows = networks["both"], []
+    for kind in ("rigid (ICP)", "rigid cleaned"):
+        cells = []
+        for test, parts in of_kinds[kind].items():
+            for part, (others, _) in parts.items():
+                ours = of_kinds["densify measured"][test][part][0]
+                cells.append(f"{100 * (1 - ours / others):.0f} %")
+        rows.append([kind, *cells])
+    return table(["instead of", *training_titles(networks)], rows)
+
+
 def other_training(networks: Any) -> str:
     """Return the table of outliers of networks that were trained on other recordings."""
     rows = [
@@ -170,21 +187,26 @@ def training_titles(networks: Any) -> list[str]:
 def best_in_bold(kinds: Any) -> list[list[str]]:
     """Return outliers in % with their standard error, for each kind of maps, test and part.
 
-    The least of a test and part is in bold, with those within two standard errors of it.
+    The least of a test and part is in bold, with those within two standard errors of it. None is
+    if these are more than half of the kinds.
     """
     figures = [
         [both for parts in tests.values() for both in parts.values()] for tests in kinds.values()
     ]
-    best = [min(column) for column in zip(*figures, strict=True)]
-    return [
-        [
-            f"**{mean:.2f}** ± {error:.2f}"
-            if mean - least <= 2 * math.hypot(error, least_error)
-            else f"{mean:.2f} ± {error:.2f}"
-            for (mean, error), (least, least_error) in zip(row, best, strict=True)
-        ]
-        for row in figures
-    ]
+    columns = []
+    for column in zip(*figures, strict=True):
+        least, least_error = min(column)
+        is_best = [mean - least <= 2 * math.hypot(error, least_error) for mean, error in column]
+        is_decided = sum(is_best) <= len(is_best) / 2
+        columns.append(
+            [
+                f"**{mean:.2f}** ± {error:.2f}"
+                if best and is_decided
+                else f"{mean:.2f} ± {error:.2f}"
+                for (mean, error), best in zip(column, is_best, strict=True)
+            ]
+        )
+    return [list(row) for row in zip(*columns, strict=True)]
 
 
 def training_figures(networks: Any) -> Any:
@@ -216,13 +238,16 @@ ERRORS: dict[str, Callable[[Any], str]] = {
 
 
 def baselines(errors: Any, stored: gate.Stored) -> str:
-    """Return a heading for each truth, and a table for each error, by part of the pixels."""
+    """Return a heading and tables for each truth, by part of the pixels; only one is unfolded."""
     blocks = []
     for truth, (title, _) in TRUTHS.items():
-        blocks.append(f"## {title}")
-        for error in ERRORS:
-            rows = rows_of_parts(truth, errors[truth], error)
-            blocks.append(table([error, *TITLES.values()], rows))
+        first, *others = (
+            table([error, *TITLES.values()], rows_of_parts(truth, errors[truth], error))
+            for error in ERRORS
+        )
+        blocks += [f"## {title}", first, '<details markdown="1">']
+        blocks.append(f"<summary>{title.split(',')[0]}: 1 px and mean absolute error</summary>")
+        blocks += [*others, "</details>"]
     return "\n" + "\n\n".join(blocks) + "\n"
 
 
@@ -243,33 +268,63 @@ def rows_of_parts(truth: str, methods: Any, error: str) -> list[list[str]]:
 
 
 def commands() -> str:
-    """Return a heading for each command, with what it does and a table of its options."""
-    return "\n" + "\n\n".join(blocks_of(command_line())) + "\n"
+    """Return the options of many commands, then each command with its text and its own options."""
+    parsers = [*commands_of(command_line())]
+    uses = Counter(row for parser in parsers for row in options_of(parser))
+    shared = {row for row, count in uses.items() if count >= 5}
+    first_uses = [row for row in uses if row in shared]
+    rows = sorted(first_uses, key=lambda row: ("-" in row[0][:1], row[0].startswith("--json")))
+    blocks = ["## Common options", table(["option", "meaning"], coded(rows))]
+    for parser in parsers:
+        own = [row for row in options_of(parser) if row not in shared]
+        common = [
+            f"`{spelled(action).split()[0] if action.option_strings else spelled(action)}`"
+            for action in actions_of(parser)
+            if row_of(action) in shared
+        ]
+        blocks += [f"## {parser.prog}", plain(parser.description)]
+        blocks += [table(["option", "meaning"], coded(own))] if own else []
+        blocks += [f"[Common options](#common-options): {', '.join(common)}."]
+        blocks += [plain(parser.epilog)] if parser.epilog else []
+    return "\n" + "\n\n".join(blocks) + "\n"
 
 
-def blocks_of(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """Yield the heading, text and table of options of a command, or of those in its group."""
+def commands_of(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield the parser of a command, or those of the commands in its group."""
     groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
     for choices in groups:
         for command in choices.choices.values():
-            yield from blocks_of(command)
+            yield from commands_of(command)
     if not groups:
-        rows = [
-            [f"`{spelled(action)}`", plain(action.help)]
-            for action in parser._actions
-            if "-h" not in action.option_strings
-        ]
-        yield f"## {parser.prog}"
-        yield plain(parser.description)
-        yield table(["option", "meaning"], rows)
-        if parser.epilog:
-            yield plain(parser.epilog)
+        yield parser
+
+
+def actions_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """Return the arguments of a command but ``--help``, positional ones first, ``--json`` last."""
+    actions = [action for action in parser._actions if "-h" not in action.option_strings]
+    return sorted(actions, key=lambda a: (bool(a.option_strings), "--json" in a.option_strings))
+
+
+def options_of(parser: argparse.ArgumentParser) -> list[tuple[str, str]]:
+    """Return how each argument of a command is written, and its meaning."""
+    return [row_of(action) for action in actions_of(parser)]
+
+
+def row_of(action: argparse.Action) -> tuple[str, str]:
+    """Return how an argument is written, and its meaning; recordings alike for one and several."""
+    usage = spelled(action)
+    return usage.removesuffix(" …") if action.metavar == "SPEC" else usage, plain(action.help)
+
+
+def coded(rows: Sequence[tuple[str, str]]) -> list[list[str]]:
+    """Return rows of a table with the option as code."""
+    return [[make_api.code(usage), meaning] for usage, meaning in rows]
 
 
 def plain(text: str | None) -> str:
     """Return a text without marks of Markdown, and without the folder of the installed settings."""
     text = re.sub(r"\S+/(default\.yaml)", r"configs/\1", text or "")
-    return re.sub(r"[|*<\[\]]", r"\\\g<0>", text)
+    return re.sub(r"[|*\[\]]", r"\\\g<0>", text).replace("<", "&lt;")
 
 
 def spelled(action: argparse.Action) -> str:
@@ -277,25 +332,31 @@ def spelled(action: argparse.Action) -> str:
     value = "{" + ",".join(map(str, action.choices)) + "}" if action.choices else action.metavar
     value = "" if action.nargs == 0 else str(value or action.dest.upper())
     value += " …" if action.nargs in ("+", "*") else ""
-    return " ".join(filter(None, [*action.option_strings, value])).replace("|", "\\|")
+    return " ".join(filter(None, [*action.option_strings, value]))
+
+
+def settings() -> str:
+    """Return the file of all settings as a block of code."""
+    return f"\n```yaml\n{(ROOT / 'configs/default.yaml').read_text()}```\n"
 
 
 def with_tables(page: str) -> str:
     """Return the text of a page with its tables made again."""
     numbers, stored = json.loads(NUMBERS.read_text()), gate.read(ROOT / "tests/gate.json")
-    makers = {f.__name__: f for f in (headline, comparison, judged, baselines)}
-
-    of_training = {f.__name__: f for f in (training, other_training, trained)}
+    of_errors = {f.__name__: f for f in (headline, comparison, judged, baselines)}
+    of_training = {f.__name__: f for f in (training, gains, other_training, trained)}
+    of_code = {f.__name__: f for f in (commands, settings, make_api.api)}
 
     def made(found: re.Match[str]) -> str:
-        if found[2] == "cost":
+        name = found[2]
+        if name == "cost":
             text = table(["task", "CPU", "elapsed", "memory"], numbers["cost"])
-        elif found[2] == "commands":
-            text = commands()
-        elif found[2] in of_training:
-            text = of_training[found[2]](numbers["training"])
+        elif name in of_code:
+            text = of_code[name]()
+        elif name in of_training:
+            text = of_training[name](numbers["training"])
         else:
-            text = makers[found[2]](numbers["baselines"], stored)
+            text = of_errors[name](numbers["baselines"], stored)
         return f"{found[1]}{text}\n{found[3]}"
 
     return MARKED.sub(made, page)

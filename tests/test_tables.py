@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+import densify
+
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 QUOTED = re.compile(r"\[(\d[^\]]*)\]\(([^)#]*)#([^)]*)\)")  # [20 s](results.md#cost)
@@ -45,6 +47,22 @@ def test_figures_are_those_of_their_table(page: Path, maker: Any) -> None:
 def test_costs_are_links_to_their_table(name: str) -> None:
     prose = re.sub(r"```.*?```", "", (ROOT / name).read_text(), flags=re.DOTALL)
     assert not COST.findall(QUOTED.sub("", prose))
+
+
+def test_bold_marks_a_decided_column_only(maker: Any) -> None:
+    def bold(*means: float) -> list[bool]:
+        kinds = {str(i): {"test": {"all": (mean, 0.1)}} for i, mean in enumerate(means)}
+        return [cell.startswith("**") for (cell,) in maker.best_in_bold(kinds)]
+
+    assert bold(1.0, 2.0, 3.0, 4.0) == [True, False, False, False]
+    assert bold(1.0, 1.2, 3.0, 4.0) == [True, True, False, False]
+    assert bold(1.0, 1.2, 1.1, 4.0) == [False] * 4
+
+
+def test_the_page_of_the_api_has_every_public_name() -> None:
+    page = (ROOT / "docs/api.md").read_text()
+    names = set(dir(densify)) - {"Config", "__version__"}
+    assert names <= set(re.findall(r"^### (\w+)$", page, re.MULTILINE))
 
 
 def test_a_share_of_few_pixels_is_no_figure(maker: Any) -> None:
