@@ -145,7 +145,7 @@ def short_cost(costs: Sequence[Sequence[str]]) -> str:
         "the very first run": "the first run above, two cameras",
         "the same again": "the same again, with `--overwrite`",
         "a key of KITTI": "a key of KITTI, one camera",
-        "each key of a set": "each key of a training set of it, one camera",
+        "each key of a set": "each key of a training set of KITTI, one camera",
     }
     rows = []
     for begin, label in labels.items():
