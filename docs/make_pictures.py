@@ -332,7 +332,7 @@ def make_set(runs: Path, pandaset: Path | None) -> None:
     if densify(["report", str(folder), "--overwrite"]):
         raise SystemExit("densify report failed; its message is above")
     command = [browser, "--headless", "--no-sandbox", "--hide-scrollbars"]
-    command += [f"--screenshot={screenshot}", "--window-size=1200,1560"]
+    command += [f"--screenshot={screenshot}", "--window-size=1200,1840"]
     subprocess.run([*command, (folder / "report.html").as_uri()], check=True)
     write("set", np.asarray(Image.open(screenshot).convert("RGB")))
 

@@ -72,11 +72,16 @@ def share(cell: Any, stored: gate.Stored | None, keys: Sequence[str] = (), figur
     return f"{outliers:.2f} ± {luck:.2f} {covered}"
 
 
-def with_best(texts: Mapping[str, str]) -> list[str]:
-    """Return the texts of methods, in bold the least of the measured and of the filled maps."""
+def with_best(texts: Mapping[str, str], cells: Mapping[str, Any]) -> list[str]:
+    """Return the texts of methods, in bold the least of the measured and of the filled maps.
+
+    Maps with less than a quarter of the greatest coverage of their group are not among them.
+    """
     best = {}
     for group in (MEASURED, FILLED):
-        numbers = {m: texts[m].split()[0] for m in group if texts.get(m, "–") != "–"}
+        covered = {m: cells[m]["coverage"] for m in group if texts.get(m, "–") != "–"}
+        least_covered = 0.25 * max(covered.values(), default=0.0)
+        numbers = {m: texts[m].split()[0] for m in covered if covered[m] >= least_covered}
         least = min(map(float, numbers.values()), default=0.0)
         best |= {method: number for method, number in numbers.items() if float(number) == least}
     return [re.sub(r"^\S+", r"**\g<0>**", text) if m in best else text for m, text in texts.items()]
@@ -103,9 +108,10 @@ def rows_of_truths(errors: Any, methods: Sequence[str], stored: gate.Stored | No
                 has_luck = kind != method and stored is not None
                 luck = (keys, f"{kind} {part}") if has_luck else ()
                 texts[method] = share(errors[truth][method][part], stored, *luck)
-            cells = dict(zip(METHODS, with_best(texts), strict=True))
+            cells = {method: errors[truth][method][part] for method in METHODS}
+            marked = dict(zip(METHODS, with_best(texts, cells), strict=True))
             label_of_row = label if part == "all" else "its moving pixels"
-            rows.append([label_of_row, *(cells[method] for method in methods)])
+            rows.append([label_of_row, *(marked[method] for method in methods)])
     return table(["outliers in % (coverage)", *(TITLES[m] for m in methods)], rows)
 
 
@@ -135,6 +141,23 @@ def of_gate(stored: gate.Stored, keys: Sequence[str], figure: str) -> str:
     covered = sum(map(coverage, curves)) / len(keys) / 100
     cell = {"num_compared": math.inf, "outliers": outliers, "coverage": covered}
     return share(cell, stored, keys, figure)
+
+
+def short_cost(costs: Sequence[Sequence[str]]) -> str:
+    """Return the table of the README: seconds and memory of four tasks of the table of costs."""
+    labels = {
+        "the very first run": "the first run above, two cameras",
+        "the same again": "the same again, with `--overwrite`",
+        "a key of KITTI": "a key of KITTI, one camera",
+        "each key of a set": "each key of a training set of KITTI, one camera",
+    }
+    rows = []
+    for begin, label in labels.items():
+        (found,) = (row for row in costs if row[0].startswith(begin))
+        _, _, elapsed, memory = found
+        per_worker = ", each worker" if "a worker" in memory else ""
+        rows.append([label, elapsed.split(" s")[0], memory.split(" GB")[0] + per_worker])
+    return table(["on two cores", "seconds", "memory in GB"], rows)
 
 
 def training(networks: Any) -> str:
@@ -263,7 +286,7 @@ def rows_of_parts(truth: str, methods: Any, error: str) -> list[list[str]]:
         has_figure = {m: c["num_compared"] >= LEAST_PIXELS for m, c in cells.items()}
         texts = {m: ERRORS[error](c) if has_figure[m] else "–" for m, c in cells.items()}
         label = "discontinuities" if part == "edge" else part.replace("-", " to ")
-        rows.append([f"{label} ({cell['num_pixels']:,})", *with_best(texts)])
+        rows.append([f"{label} ({cell['num_pixels']:,})", *with_best(texts, cells)])
     return rows
 
 
@@ -351,6 +374,8 @@ def with_tables(page: str) -> str:
         name = found[2]
         if name == "cost":
             text = table(["task", "CPU", "elapsed", "memory"], numbers["cost"])
+        elif name == "short_cost":
+            text = short_cost(numbers["cost"])
         elif name in of_code:
             text = of_code[name]()
         elif name in of_training:

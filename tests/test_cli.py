@@ -96,10 +96,13 @@ def test_output_is_kept_or_replaced_by_the_same_bytes(
 
 
 def test_compare_prints_a_table_and_writes_it(border_drive: Path, tmp_path: Path, capsys) -> None:
-    command = ["compare", border_drive, "--key", FRAMES[2], "--window", "1", "--config", "fast"]
+    command = ["compare", border_drive, "--window", "1", "--config", "fast"]
     command += ["--set", "register.source=dataset", "--methods", "none, icp,flow"]
     assert exit_code(*command, "--out", tmp_path) == 0
-    lines = capsys.readouterr().out.splitlines()
+    told, middle = capsys.readouterr(), FRAMES[len(FRAMES) // 2]
+    assert f"no --key given: taking the middle frame, {middle}, of " in told.err
+    assert [path.name for path in tmp_path.iterdir()] == [f"{middle:06d}"]
+    lines = told.out.splitlines()
     assert re.split("  +", lines[0])[1:] == ["single sweep", "rigid accumulation", "scene flow"]
     for row in ("image_02 density, measured", "ghost rate", "image_02 key held out, all, coverage"):
         assert any(line.startswith(row) for line in lines), row
@@ -165,7 +168,7 @@ def test_the_recording_is_an_argument_or_an_option(border_drive: Path, capsys) -
 # One command each that cannot work, and what its one line must say. {tmp} is an empty folder.
 RUN = ["run", "--key", "120", "--out", "{tmp}/out"]
 BAD_COMMANDS: list[tuple[list[str], list[str]]] = [
-    ([], ["VERB"]),
+    ([], ["COMMAND"]),
     (["comapre"], ["'comapre'", "did you mean compare?"]),
     ([*RUN, "--windw", "3"], ["--windw", "did you mean --window?", "run --help"]),
     ([*RUN, "--win", "3"], ["--win"]),
@@ -176,6 +179,7 @@ BAD_COMMANDS: list[tuple[list[str], list[str]]] = [
     (["run", "--out", ""], ["got an empty argument after '--out'"]),
     ([*RUN, "{tmp}/absent"], ["{tmp}/absent", "no such folder"]),
     (["run", STREET, "--key", "4000"], ["4000", "159"]),
+    (["compare", STREET, "--key", "4000"], ["--key 4000: no such frame", "159"]),
     ([*RUN, STREET, "--camera", "image_07"], ["image_07", "image_02"]),
     ([*RUN, "--set", "objective.alfa=3"], ["objective.alfa", "did you mean alpha?"]),
     (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth maps on disk against the truth on disk: which belong together, and what the verb says."""
+"""Depth maps on disk against the truth on disk: which belong together, and what is printed."""
 
 from __future__ import annotations
 

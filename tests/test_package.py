@@ -43,12 +43,12 @@ def modules_after(code: str, cwd: Path | None = None) -> set[str]:
 
 
 def test_imports_and_help_are_light() -> None:
-    """The package, the version, and the help of every verb."""
-    verbs = "run compare dataset flow train labels info doctor simulate export report evaluate"
+    """The package, the version, and the help of every command."""
+    commands = "run compare dataset flow train labels info doctor simulate export report evaluate"
     code = (
         "import densify, densify.config\n"
         "from densify.cli import main\n"
-        f"for command in ['--version', '--help'] + {verbs.split()} + ['bench', 'bench flow']:\n"
+        f"for command in ['--version', '--help'] + {commands.split()} + ['bench', 'bench flow']:\n"
         "    try:\n        main([*command.split(), '--help'])\n"
         "    except SystemExit as end:\n        assert end.code == 0\n"
         "else:\n    print()"

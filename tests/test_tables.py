@@ -65,6 +65,21 @@ def test_the_page_of_the_api_has_every_public_name() -> None:
     assert names <= set(re.findall(r"^### (\w+)$", page, re.MULTILINE))
 
 
+def test_bold_needs_a_quarter_of_the_greatest_coverage(maker: Any) -> None:
+    covered = {"single sweep": 0.1, "rigid (ICP)": 0.8, "rigid, cleaned": 0.19}
+    cells = {method: {"coverage": covered.get(method, 0.4)} for method in maker.METHODS}
+    texts = dict(zip(maker.METHODS, ("0.1", "9.0", "0.2", "3.0", "–", "2.0", "2.00"), strict=True))
+    assert maker.with_best(texts, cells) == [
+        "0.1",
+        "9.0",
+        "0.2",
+        "**3.0**",
+        "–",
+        "**2.0**",
+        "**2.00**",
+    ]
+
+
 def test_a_share_of_few_pixels_is_no_figure(maker: Any) -> None:
     cell = {"num_compared": 199, "coverage": 0.01, "outliers": 0.0, "mae_m": 0.1}
     methods = {method: {"all": cell | {"num_pixels": 300}} for method in maker.METHODS}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The manual of the verbs, and the parser made of it; a verb's module is imported when it runs."""
+"""The manual of the commands, and their parser; a command's module is imported when it runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from densify.version import __version__
 if TYPE_CHECKING:
     from densify.cli.terminal import Answer
 
-# Options of several verbs
+# Options of several commands
 _RECORDINGS = """\
 [SPEC+]  the recording: a folder or file, READER:PATH, or the built-in simulation
     street[:PRESET][?seed=N&sensor=NAME&hz=RATE&tilt=DEG] (default: street)
@@ -52,7 +52,7 @@ _BENCH_KEY = "--key K...  key frame; may be given several times (default: 120)"
 _READERS = "; ".join(f"{row.name}: {row.holds}" for row in READERS.built_in)
 _SETTINGS_FILE = presets()["default"]
 
-# A section of the manual: "== VERB (MODULE)", what the verb does, its options as `add_options`
+# A section of the manual: "== COMMAND (MODULE)", what it does, its options as `add_options`
 # reads them, and after a blank line further help.
 _USUAL = f"""
 == info (recordings)
@@ -88,7 +88,7 @@ Every setting, with its default and its effect: {_SETTINGS_FILE}
 
 == compare (runs)
 compare methods on one key frame: table, picture, JSON
---key K  number of the frame to densify (required)
+--key K  number of the frame to densify (default: the middle frame of the recording)
 {_KEY_OPTIONS}
 --methods NAME,…  none (single sweep), icp (rigid accumulation), icp-far (icp with sweeps beyond
     the window), icp-visible (icp with visibility), flow-plain (flow without visibility), paper
@@ -304,10 +304,10 @@ judge a change: the figures of 16 keys and 3 pairs beside stored ones, with thei
 --write FILE  store the figures as they are now
 --draws N =0  times that poses are moved to measure luck anew; 0 keeps the stored luck
 
-Depth maps are compared at equal coverage, key by key. A figure is better or worse if its mean
-change exceeds two standard deviations of luck (poses moved by 2 mm and 0.01°) and two standard
-errors between the keys. Registration and flow are kept between calls while their code stays the
-same.
+Depth maps are compared at equal coverage, key by key. Luck is the spread of a figure when the poses
+are moved by 2 mm and 0.01°. A figure is better or worse if its mean change exceeds two standard
+deviations of luck and two standard errors between the keys. Registration and flow are kept between
+calls while their code stays the same.
 
 == bench training (bench)
 train a network that completes depth on several kinds of maps, and test each
@@ -359,15 +359,15 @@ def answers(options: argparse.Namespace) -> Iterable[Answer]:
 
 
 def command_line() -> argparse.ArgumentParser:
-    """Return the parser of all verbs, made of the sections of the manual."""
+    """Return the parser of all commands, made of the sections of the manual."""
     parser = _Parser(
         prog="densify",
-        usage="densify VERB [SPEC] [options]",
+        usage="densify COMMAND [SPEC] [options]",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"densify {__version__}")
     commands = parser.add_subparsers(
-        prog="densify", metavar="VERB", required=True, help=argparse.SUPPRESS
+        prog="densify", metavar="COMMAND", required=True, help=argparse.SUPPRESS
     )
     groups: dict[str, Any] = {"": commands}
     for section in re.split("^== ", _USUAL + _MORE, flags=re.MULTILINE)[1:]:
@@ -386,17 +386,17 @@ def command_line() -> argparse.ArgumentParser:
     usual, more = "\n".join(abouts[:num_usual]), "\n".join(abouts[num_usual:])
     parser.description = (
         "Dense depth maps from lidar recordings, with the moving objects kept sharp.\n\n"
-        f"verbs:\n{usual}\n\nmore:\n{more}"
+        f"commands:\n{usual}\n\nmore:\n{more}"
     )
     parser.epilog = (
-        "densify VERB --help explains a verb. A first try: densify run --key 120\n"
+        "densify COMMAND --help explains a command. A first try: densify run --key 120\n"
         "Exit codes: 0 done, 1 the computation failed, 2 bad input, 130 interrupted."
     )
     return parser
 
 
 def _add(commands: Any, name: str, about: str, epilog: str = "") -> argparse.ArgumentParser:
-    """Add a verb or a group of verbs, and return its parser."""
+    """Add a command or a group of commands, and return its parser."""
     description = f"{about[0].upper()}{about[1:]}."
     parser: argparse.ArgumentParser = commands.add_parser(
         name, help=about, description=description, epilog=epilog or None
@@ -411,7 +411,7 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(**options, allow_abbrev=False)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse the arguments. Refuse an unknown option here, where the verb is known."""
+        """Parse the arguments. Refuse an unknown option here, where the command is known."""
         options, unknown = super().parse_known_args(args, namespace)
         misspelt = next((text for text in unknown if text.startswith("--")), None)
         if misspelt is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer the verbs of finished runs, training sets and depth maps."""
+"""Answer the commands of finished runs, training sets and depth maps."""
 
 from __future__ import annotations
 

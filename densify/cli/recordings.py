@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Answer the verbs of recordings: look into them, simulate them, make sets and scene flow."""
+"""Answer the commands of recordings: look into them, simulate them, make sets and scene flow."""
 
 from __future__ import annotations
 

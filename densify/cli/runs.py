@@ -66,7 +66,10 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify run``: densify the keys and yield an answer for each."""
     config, spec = config_of(options), Spec.parse(recording_of(options)).absolute()
     sequence = open_sequence(spec)
-    keys = _keys_of(sequence, options)
+    asked = [*(options.key or [])]
+    if options.keys is not None:
+        asked += selected_frames(sequence, options.keys)
+    keys = _keys_of(sequence, asked)
     out = options.out or default_folder(sequence.name)
     check_recording(out, sequence.name, spec, keys)
     for key in keys:
@@ -98,12 +101,9 @@ def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
     raise_failures(failures, len(keys), "key")
 
 
-def _keys_of(sequence: LidarSequence, options: argparse.Namespace) -> list[int]:
-    """Return the ascending keys of the options, by default the recording's middle frame."""
-    keys = {*(options.key or [])}
-    if options.keys is not None:
-        keys |= {*selected_frames(sequence, options.keys)}
-    frames = format_frames(sequence.frames)
+def _keys_of(sequence: LidarSequence, asked: Sequence[int]) -> list[int]:
+    """Return the keys that are asked for, ascending, by default the recording's middle frame."""
+    keys, frames = {*asked}, format_frames(sequence.frames)
     for key in sorted(keys - {*sequence.frames}):
         raise InputError(f"--key {key}: no such frame in {sequence.name}; it has {frames}")
     if not keys:
@@ -127,10 +127,11 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     """Answer ``densify compare``: densify one key by several methods and yield their scores."""
     config, spec = config_of(options), Spec.parse(recording_of(options)).absolute()
     sequence = open_sequence(spec)
+    (key,) = _keys_of(sequence, [] if options.key is None else [options.key])
     out = options.out or default_folder(sequence.name)
-    check_recording(out, sequence.name, spec, [options.key])
-    check_writable(out, options.key, options.overwrite, "compare")
-    wanted = (options.key, options.window, options.camera, config)
+    check_recording(out, sequence.name, spec, [key])
+    check_writable(out, key, options.overwrite, "compare")
+    wanted = (key, options.window, options.camera, config)
     with progress_on_stderr() as progress:
         results = pipeline.compare(sequence, *wanted, progress, options.methods or USUAL)
     paths = write_comparison(
@@ -138,10 +139,10 @@ def answer_compare(options: argparse.Namespace) -> Iterator[Answer]:
     )
     if config.output.report:
         paths.append(write_key_page(paths[0].parent, "compare.json"))
-    scores = {"key": options.key, "methods": {n: _key_facts(r) for n, r in results.items()}}
+    scores = {"key": key, "methods": {n: _key_facts(r) for n, r in results.items()}}
     yield Answer(_comparison(results), scores, paths, first_of(paths, _FIRST_OF_COMPARISON))
     distinct = dict.fromkeys(w for result in results.values() for w in result.warnings)
-    log_warnings((warning, "", options.key) for warning in distinct)
+    log_warnings((warning, "", key) for warning in distinct)
 
 
 def _summary(result: Result) -> str:

@@ -222,7 +222,7 @@ _LINE_S = 10.0  # least time between two lines of progress without a terminal
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a verb."""
+    """The answer of a command."""
 
     text: str = ""  # text for people
     # Values for programs (``--json``). Lists of several answers are concatenated.
