@@ -94,6 +94,7 @@ TWO = [CAMERA, replace(CAMERA, name="rear")]
 UPSIDE_DOWN = replace(
     CAMERA, T_cam_lidar=np.diag([1.0, -1, -1, 1]) @ shifted(0, 500, 0) @ CAMERA.T_cam_lidar
 )
+INVERTED = replace(CAMERA, T_cam_lidar=poses.inverse(CAMERA.T_cam_lidar))
 ODOMETRY = {"source": "kiss-icp"}
 TWICE = "compensated already, to {}, and now a second time".format
 LOOKS_WRONG = [
@@ -106,6 +107,8 @@ LOOKS_WRONG = [
         {},
     ),
     (Changed(cameras=[UPSIDE_DOWN]), "0.00 % of the pixels have a measured depth", {}),
+    (Changed(cameras=[UPSIDE_DOWN]), "front hangs upside down by its T_cam_lidar", {}),
+    (Changed(cameras=[INVERTED]), "front lies on its side by its T_cam_lidar", {}),
     (
         Changed(cameras=TWO, images_ms={"front": {3: 300}}),
         "rear is left out: the recording has no images of it",

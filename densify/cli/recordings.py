@@ -197,7 +197,8 @@ def _describe_set(summary: Summary) -> str:
     if summary.num_made:
         lines[0] += f"; {summary.num_made} now, {describe_pace(summary.records.values())}"
     means = [(title, facts["means"][score]) for score, title in _SCORES.items()]
-    lines.append(", ".join(f"{title} {percent(mean)}" for title, mean in means if mean is not None))
+    known = [f"{title} {percent(mean)}" for title, mean in means if mean is not None]
+    lines += [f"on average {', '.join(known)}"] if known else []
     missing = ["{drive} {key} {status}: {reason}".format(**key) for key in facts["missing"]]
     lines += missing[:_MOST_REASONS]
     if len(missing) > _MOST_REASONS:

@@ -212,12 +212,28 @@ def raise_failures(failures: Mapping[int, Exception], num: int, unit: str) -> No
 if TYPE_CHECKING:
     from densify.geometry.types import Progress
 
-_BAR = "{desc:<10} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
+_BAR = "{desc:<27} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 _SCHEMA = 1
 """Version of what ``--json`` prints; grows when a key changes its meaning or goes."""
 _MOST_FIRST = 3
 _MOST_WARNINGS = 20
 _LINE_S = 10.0  # least time between two lines of progress without a terminal
+_MOST_PATHS = 6  # more written files are counted
+_TITLES = {
+    "read": "reading sweeps",
+    "register": "registering sweeps",
+    "ground": "finding the ground",
+    "flow": "finding moving objects",
+    "far": "registering the road around",
+    "accumulate": "accumulating points",
+    "images": "reading images",
+    "project": "making depth maps",
+    "colour": "colouring the cloud",
+    "held out": "scoring without the key",
+    "score": "scoring",
+    "prior": "completing with the prior",
+}
+"""Pipeline stage -> what is shown for it."""
 
 
 @dataclass(frozen=True)
@@ -232,9 +248,12 @@ class Answer:
     first: Mapping[Path, str] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
-        """Return the text, every file, and the files to open first."""
+        """Return the text, the files or the folder of many files, and the files to open first."""
         lines = [self.text] if self.text else []
-        lines += map(str, self.files)
+        if len(self.files) > _MOST_PATHS:
+            lines.append(f"{len(self.files)} files in {os.path.commonpath(self.files)}")
+        else:
+            lines += map(str, self.files)
         if self.first:
             rows = [[f"  {path}", content] for path, content in self.first.items()]
             lines += ["open first:", aligned(rows, "<")]
@@ -382,16 +401,19 @@ def progress_on_stderr() -> Iterator[Progress]:
     from tqdm import tqdm
 
     is_hidden = not sys.stderr.isatty()
-    shown_s, shown_stage = time.monotonic(), ""
+    begin_s = shown_s = time.monotonic()
+    shown_stage = ""
     with tqdm(total=1, file=sys.stderr, leave=False, bar_format=_BAR, disable=is_hidden) as bar:
 
         def show(stage: str, done: int, total: int) -> None:
             nonlocal shown_s, shown_stage
+            stage = _TITLES.get(stage, stage)
             if is_hidden:
                 is_end = done == total and stage == shown_stage
                 if is_end or time.monotonic() - shown_s >= _LINE_S:
                     shown_s, shown_stage = time.monotonic(), "" if is_end else stage
-                    print(f"densify: {stage}, {done} of {total}", file=sys.stderr, flush=True)
+                    text = f"densify: {shown_s - begin_s:.0f} s: {stage}, {done} of {total}"
+                    print(text, file=sys.stderr, flush=True)
                 return
             if done < bar.n or total != bar.total:  # another stage
                 bar.set_description(stage, refresh=False)

@@ -349,6 +349,8 @@ def _plot(made: JudgedSet, score: Score, rows: Mapping[Key, str]) -> str:
     if not values:
         return ""
     usual = score.usual()
+    if score.name == "seconds":  # rare waits would flatten the others
+        values = [min(value, 3 * float(np.median(values))) for value in values]
     lowest, highest = min(values + usual[:1]), max(values + usual[1:])
     if score.is_bad > 0:  # a lower value is no worse
         lowest, usual = 0.0, [0.0, *usual[1:]] if usual else []
@@ -410,7 +412,7 @@ def _card(made: JudgedSet, record: KeyRecord) -> str:
         )
         if (path := find_map(record, kinds, camera))
     )
-    files = f"<br>Files: {files}" if files else ""
+    files = f"{'<br>' if remarks else ''}Files: {files}" if files else ""
     return (
         f'<figure id="{_anchor("card", record)}"><figcaption>'
         f"{_link(name, _own_page(record))}, {html.escape(camera)}<br>{', '.join(texts)}"

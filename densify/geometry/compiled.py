@@ -42,7 +42,7 @@ _LEAST_ROWS = 4096  # a second thread for fewer rows takes longer than most kern
 
 
 class _Compiling(event.Listener):
-    """Log once that the first run takes longer, when numba compiles."""
+    """Log once that this run takes longer, when numba compiles."""
 
     said = False
 
@@ -50,7 +50,7 @@ class _Compiling(event.Listener):
         if not self.said and str(event.data["dispatcher"].__module__).startswith("densify."):
             self.said = True
             _progress.info(
-                "compiling the inner loops, once for this installation: about half a minute in all"
+                "compiling inner loops that this installation has not used yet: up to half a minute"
             )
 
     def on_end(self, event: event.Event) -> None:

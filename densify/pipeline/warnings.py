@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from densify.config.errors import InputError
 from densify.depth.exposure import Shot
 from densify.free_space.raw_sweeps import LOST_DEG, blind_sector, lost_deg
 from densify.geometry import poses
-from densify.geometry.types import LidarSequence, Result, Stretch, Sweep
+from densify.geometry.types import Camera, LidarSequence, Result, Stretch, Sweep
 from densify.pipeline.key_result import METHODS, looks_around
 from densify.pipeline.recording import Recording
 from densify.readers.timeline import format_frames
@@ -27,6 +27,7 @@ _LEAST_SIDE = 2  # sweeps on each side of the key, over which recorded poses are
 # Suspicious shares of the points. A car's own returns were up to 0.14. Clean recordings have up to
 # 0.0021 below the ground. Most returns are of ground and buildings.
 _MAX_NEAR, _MAX_BELOW, _MAX_MOVING = 0.2, 0.0025, 1 / 3
+_MAX_TILT = np.sin(np.deg2rad(45))  # of a camera against upright and level
 
 
 def add_warnings(
@@ -47,6 +48,7 @@ def add_warnings(
         *_warn_of_sweeps(recording, key),
         *_warn_of_motion(recording, key),
         *_warn_of_images(sequence, shots),
+        *_warn_of_poses(shot.camera for shot in shots.values()),
     ]
     warned = {}
     for method, result in results.items():
@@ -54,6 +56,25 @@ def add_warnings(
         warnings = dict.fromkeys([*shared, *warn_of_result(result, stretch)])
         warned[method] = replace(result, warnings=tuple(warnings))
     return warned
+
+
+def _warn_of_poses(cameras: Iterable[Camera]) -> Iterator[str]:
+    """Yield a warning for each camera that lies on its side, hangs upside down or looks up.
+
+    This detects an inverted pose or one of other axes, where a single image shows too little.
+    """
+    for name, camera in {camera.name: camera for camera in cameras}.items():
+        right, down, ahead = camera.T_cam_lidar[:3, 2]  # z components of the camera's axes
+        postures = {
+            "lies on its side": abs(right) > _MAX_TILT,
+            "hangs upside down": down > _MAX_TILT,
+            "looks up": ahead > _MAX_TILT,
+        }
+        for posture in [posture for posture, is_so in postures.items() if is_so]:
+            yield (
+                f"{name} {posture} by its T_cam_lidar: if it does not, the pose is inverted "
+                f"(T_lidar_cam) or of other axes; densify doctor looks into it"
+            )
 
 
 def _warn_of_window(recording: Recording, key: int, has_flow: bool) -> Iterator[str]:
