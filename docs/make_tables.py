@@ -144,10 +144,9 @@ def of_gate(stored: gate.Stored, keys: Sequence[str], figure: str) -> str:
 
 
 def short_cost(costs: Sequence[Sequence[str]]) -> str:
-    """Return the table of the README: seconds and memory of four tasks of the table of costs."""
+    """Return the table of the README: seconds and memory of three tasks of the table of costs."""
     labels = {
         "the very first run": "the first run above, two cameras",
-        "the same again": "the same again, with `--overwrite`",
         "a key of KITTI": "a key of KITTI, one camera",
         "each key of a set": "each key of a training set of KITTI, one camera",
     }
