@@ -82,10 +82,10 @@ class Judgement(NamedTuple):
     median: float
     is_suspect: bool
 
-    def reason(self) -> str:
-        """Return why the key is suspect or the worst, as text."""
+    def reason(self, with_camera: bool) -> str:
+        """Return why the key is suspect as text, with the name of the camera if asked for."""
         score = self.series.score
-        camera = f" of {self.series.camera}" if self.series.camera else ""
+        camera = f" of {self.series.camera}" if with_camera and self.series.camera else ""
         text = f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}"
         if score.is_error:
             return f"{text}, usual up to {score.usual()[1]:g} {score.unit}"
@@ -110,6 +110,11 @@ class JudgedSet(NamedTuple):
     worst: Mapping[Key, Judgement]  # the worst score of each key that is done
     suspects: Mapping[Key, Sequence[Judgement]]  # suspect scores of the suspect keys alone
     series: Sequence[Series]  # the scores that a key of the set has, by camera
+
+    @property
+    def cameras(self) -> list[str]:
+        """The names of the cameras that have scores."""
+        return sorted({series.camera for series in self.series if series.camera})
 
     @property
     def scores(self) -> list[Score]:

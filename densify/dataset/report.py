@@ -155,7 +155,7 @@ def _state(made: JudgedSet, command: str) -> str:
     kind = "Preview" if command else "Not finished"
     num_tried = f"{len(planned & tried):,} of {len(planned):,} keys"
     rest = describe_rest(made.records, num_left)
-    how = "run the command that made the set again, without --preview"
+    how = "run the command that made the set again, without <code>--preview</code>"
     how = f"<code>{html.escape(command)}</code>" if command else how
     later = (
         "The finished set is checked once more: a key that is far worse than the keys around it "
@@ -179,12 +179,12 @@ def _verdict(made: JudgedSet, targets: Mapping[Key, str]) -> tuple[str, str]:
         links = [_suspect_link(made, name, targets) for name in named]
         num_more = len(made.suspects) - len(named)
         links += [f"and {num_more:,} more"] if num_more else []
-        noun = "key is" if num_done == 1 else "keys are"
-        count = f"{len(made.suspects):,} of {num_done:,} {noun} suspect"
+        verb = "is" if len(made.suspects) == 1 else "are"
+        count = f"{len(made.suspects):,} of {num_done:,} keys {verb} suspect"
         lines = [f"! {count}: {', '.join(links)}."]
     if worse:
         level = "bad"
-        names = ", ".join(_title(series).lower() for series in worse)
+        names = ", ".join(_title(made, series).lower() for series in worse)
         lines.insert(0, f"✗ The median key is worse than usual on {_USUAL}: {html.escape(names)}.")
     lines.append(_error_sentence(made))
     num_out = len(made.records) - num_done
@@ -198,7 +198,7 @@ def _suspect_link(made: JudgedSet, name: Key, targets: Mapping[Key, str]) -> str
     """Return the link to a suspect key, with the reason, as HTML."""
     drive, key = name
     text = f"{drive}, key {key}" if len(made.drives) > 1 else f"key {key}"
-    reason = html.escape(made.suspects[name][0].reason())
+    reason = html.escape(made.suspects[name][0].reason(len(made.cameras) > 1))
     target = targets.get(name, "")
     return f"{_link(text, target and '#' + target)} ({reason})"
 
@@ -208,7 +208,7 @@ def _error_sentence(made: JudgedSet) -> str:
     medians = {
         name: [
             f"{s.score.text(float(np.median(made.values(s))))} %"
-            + (f" ({html.escape(s.camera)})" if s.camera else "")
+            + (f" ({html.escape(s.camera)})" if len(made.cameras) > 1 else "")
             for s in made.series
             if s.score.name == name and made.values(s)
         ]
@@ -224,8 +224,10 @@ def _error_sentence(made: JudgedSet) -> str:
     )
 
 
-def _title(series: Series) -> str:
-    return f"{series.score.title}, {series.camera}" if series.camera else series.score.title
+def _title(made: JudgedSet, series: Series) -> str:
+    """Return the title of a score, with the camera if there are several."""
+    with_camera = series.camera and len(made.cameras) > 1
+    return f"{series.score.title}, {series.camera}" if with_camera else series.score.title
 
 
 def _range_head(made: JudgedSet) -> str:
@@ -249,7 +251,7 @@ def _score_row(made: JudgedSet, series: Series) -> list[str]:
         else f"{usual[0]:g} to {usual[1]:g}"
     )
     suspect = sum(any(j.series == series for j in found) for found in made.suspects.values())
-    return [html.escape(cell) for cell in (_title(series), *cells, text)] + [
+    return [html.escape(cell) for cell in (_title(made, series), *cells, text)] + [
         _marked(f"{suspect:,}", bool(suspect)) if usual else ""
     ]
 
@@ -361,7 +363,7 @@ def _plot(made: JudgedSet, score: Score, rows: Mapping[Key, str]) -> str:
 
 def _legend(made: JudgedSet) -> str:
     """Return what the marks of the plots mean as HTML, for the marks that they have."""
-    names = sorted({series.camera for series in made.series if series.camera})
+    names = made.cameras
     dots = [
         f'<svg class="mark" viewBox="0 0 8 8"><circle cx="4" cy="4" r="3" class="camera-{n % 6}"/>'
         f"</svg>&nbsp;{html.escape(name)}"
@@ -394,7 +396,7 @@ def _card(made: JudgedSet, record: KeyRecord) -> str:
     except (InputError, OSError) as error:
         pictures += f"<p>{html.escape(str(error))}</p>"
     suspect = made.suspects.get(record.name, ())
-    why = "; ".join(judgement.reason() for judgement in suspect)
+    why = "; ".join(judgement.reason(len(made.cameras) > 1) for judgement in suspect)
     texts = []
     for series in made.series:
         value = series.of(record) if series.camera in ("", camera) else None
