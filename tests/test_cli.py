@@ -19,13 +19,15 @@ import numpy as np
 import pytest
 import yaml
 
-from densify.cli import recordings
+from densify.cli import recordings, runs
 from densify.cli.commands import parse
 from densify.cli.terminal import Answer, config_of, progress_on_stderr
 from densify.config import as_mapping, resolve
 from densify.config.errors import ComputationError, InputError
+from densify.geometry.types import Result
 from tests.command import exit_code, files_in, refused
 from tests.dataset_scenes import BORDER, FRAMES, copy_drive, sweep_file
+from tests.exported import result_of
 
 STREET = "street?sensor=vlp16"
 KNOBS = ("--set", "register.source=dataset", "--set", "objective.num_neighbors=40")
@@ -106,6 +108,38 @@ def test_compare_prints_a_table_and_writes_it(border_drive: Path, tmp_path: Path
     table = json.loads(next(tmp_path.rglob("compare.json")).read_text("utf-8"))
     num_points = int(next(x for x in lines if x.startswith("points")).split()[3].replace(",", ""))
     assert num_points == table["methods"]["flow"]["num_points"]
+
+
+FEW = {"num_pixels": 900, "num_compared": 14, "coverage": 0.1, "outliers": 1 / 7, "mae_m": 0.5}
+MANY = FEW | {"num_compared": 2000, "outliers": 0.25}
+
+
+def scored(method: str, all_: dict, moving: dict) -> Result:
+    return result_of(
+        method,
+        cameras=("a",),
+        density={"a": {"measured": 0.4, "filled": 0.5}},
+        held_out={"a": {"measured": {"all": all_, "moving": moving}, "unjudged": None}},
+    )
+
+
+def test_a_share_of_few_pixels_is_a_dash_with_a_reason() -> None:
+    results = {"icp": scored("icp", MANY, FEW), "flow": scored("flow", MANY, MANY)}
+    lines = runs._comparison(results).splitlines()
+    cells = {c[0]: c[1:] for c in (re.split("  +", line) for line in lines)}
+    assert cells["a key held out, all, outliers"] == ["25.00 %", "25.00 %"]
+    assert cells["a key held out, moving, outliers"] == ["-", "25.00 %"]
+    assert cells["a key held out, moving, MAE"] == ["-", "0.500 m"]
+    assert cells["a key held out, moving, coverage"] == ["10.0 %", "10.0 %"]
+    assert lines[-1] == "-: no score, or fewer than 200 pixels to judge"
+    results["icp"] = scored("icp", MANY, MANY)
+    assert "fewer than" not in runs._comparison(results)
+    told = runs._summary(scored("flow", MANY, FEW)).splitlines()
+    assert told[-2:] == [
+        "a, key held out: outliers, on moving objects: -",
+        "-: fewer than 200 pixels to judge",
+    ]
+    assert "fewer than" not in runs._summary(scored("flow", MANY, MANY | {"num_compared": 0}))
 
 
 def test_several_keys_and_one_that_cannot_be_read(border_drive: Path, tmp_path: Path, capsys):

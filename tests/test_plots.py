@@ -36,6 +36,38 @@ def test_the_figure_is_red_nearby_blue_far_away_and_gray_without_depth():
     assert drawn.sum() == 9 and drawn[29:32, 99:102].all()  # a measurement covers 3 x 3 pixels
 
 
+def test_other_cameras_are_below_and_text_grows_with_the_width():
+    images = {shape: np.full((*shape, 3), 200, np.uint8) for shape in ((60, 600), (90, 300))}
+    front, side = images.values()
+    depth_m = np.zeros((90, 300), np.float32)
+    depth_m[40:50, 100:110] = 3.0
+    alone = plots.draw_figure(front, {"front": np.zeros((60, 600), np.float32)})
+    heights = []
+    for num_others in (1, 2, 3):
+        others = [("side", side, depth_m)] * num_others
+        figure = plots.draw_figure(front, {"front": np.zeros((60, 600), np.float32)}, others)
+        assert np.array_equal(figure[:96], alone[:96]) and figure.shape[1] == 600
+        heights.append(len(figure) - len(alone))
+        saturated = np.ptp(figure[96 : 96 + heights[-1]].astype(int), axis=2) > 100
+        assert saturated[:, :300].any() and saturated[:, 300:].any() == (num_others > 1)
+    assert heights == [36 + 180, 36 + 88, 2 * (36 + 88)]  # two beside each other, with a margin
+    wide = plots.draw_figure(np.zeros((10, 2000, 3), np.uint8), {"a": np.zeros((10, 2000))})
+    assert len(wide) == 2 * 36 + 10 + 2 * 60 and (wide[:72] == 0).any()
+
+
+@pytest.mark.parametrize(
+    ("num_compared", "expected"),
+    [
+        (200, ", 12.50 % outliers (truth)"),
+        (199, ", outliers (truth): fewer than 200 pixels to judge"),
+    ],
+)
+def test_a_share_of_few_pixels_is_no_figure(num_compared: int, expected: str) -> None:
+    scores = {"num_pixels": 300, "num_compared": num_compared, "outliers": 0.125}
+    result = result_of(cameras=("a",), depth={"a": {"measured": {"all": scores}}})
+    assert plots._error(result, "a", "measured") == expected
+
+
 # The camera that looks ahead
 
 NAMES = ["back", "left", "straight"]

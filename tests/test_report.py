@@ -327,6 +327,29 @@ def test_its_numbers_are_those_of_the_run(opened: Opened, run: Path) -> None:
     check_pointer(opened)
 
 
+def test_it_begins_with_rigid_accumulation_from_red_to_blue(opened: Opened) -> None:
+    chosen = [opened.value(f"$('{name}').value") for name in ("left", "right", "palette")]
+    assert chosen == ["icp", "measured", "turbo"]
+
+
+def test_few_pixels_no_warnings_and_a_narrow_screen(browser: Any, run: Path, tmp_path: Path):
+    folder = shutil.copytree(run, tmp_path / FOLDER)
+    metrics = json.loads((folder / "metrics.json").read_text())
+    moving = metrics["depth"]["front"]["measured"]["moving"]
+    moving |= {"num_compared": 199, "outliers": 0.4321}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    about = yaml.safe_load((folder / "run.yaml").read_text()) | {"warnings": []}
+    (folder / "run.yaml").write_text(yaml.safe_dump(about))
+    page = Opened(browser, write_report(folder, overwrite=True)[0], width=400)
+    scores = page.text("#score-tables")
+    assert "43.21" not in scores and "–: fewer than 200 pixels to judge." in scores
+    assert page.text("#warnings") == "There are no warnings."
+    assert page.value("document.documentElement.scrollWidth") <= 400
+    heights_px = "[...document.querySelectorAll('#scores th, #cost th')].map((t) => t.offsetHeight)"
+    assert max(page.value(heights_px)) < 100  # at most four lines
+    page.page.close()
+
+
 def check_pointer(opened: Opened) -> None:
     depth = results()["flow"].depth["front"]
     row, column = np.argwhere((depth.depth_m > 0) & (depth.frame != 3))[40]
@@ -371,7 +394,7 @@ def test_the_divider_and_every_layer_change_pixels(opened: Opened) -> None:
         seen.append(opened.picture("#picture"))
     layers = len(seen) - 3
     assert layers == 11 and len({*seen}) >= len(seen) - 1  # the divider at 100 shows the left layer
-    opened.set("palette", "turbo")
+    opened.set("palette", "viridis")
     opened.set("left", "filled")
     assert opened.picture("#picture") not in seen
 

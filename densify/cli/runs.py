@@ -36,7 +36,7 @@ from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import USUAL
 from densify.readers import Spec, open_sequence
 from densify.readers.timeline import format_frames
-from densify.scores.metrics import LEAST_PIXELS
+from densify.scores.metrics import LEAST_PIXELS, shown_score
 
 _FIRST_OF_RUN = {
     "report.html": "all of it, in a browser",
@@ -60,6 +60,7 @@ _SCORES = (
     ("outliers", "outliers", ".2%"),
 )
 _PRODUCTS = ("measured", "filled")
+_FEW_PIXELS = f"fewer than {LEAST_PIXELS} pixels to judge"
 
 
 def answer_run(options: argparse.Namespace) -> Iterator[Answer]:
@@ -152,7 +153,7 @@ def _summary(result: Result) -> str:
     if result.movers:
         num_apart = sum(len(mover.cloud) for mover in result.movers.values())
         moving = f"{num_apart:,} more apart, on {len(result.movers)} moving objects"
-    method = METHOD_NAMES.get(result.method, result.method)
+    method, is_few = METHOD_NAMES.get(result.method, result.method), False
     lines = [
         f"key {result.key}, {method}: {len(cloud):,} points of {len(result.frames)} sweeps "
         f"({format_frames(result.frames)}), {moving}"
@@ -164,25 +165,27 @@ def _summary(result: Result) -> str:
         lines.append(line)
         if expected := look_up(result.metrics, "expected_outliers", name):
             lines.append(f"{name}, outliers expected by confidence: {_of_pixels(**expected)}")
-        exact = {p: look_up(result.metrics, "depth", name, p, "all", "outliers") for p in _PRODUCTS}
-        if None not in exact.values():
+        truth = {p: look_up(result.metrics, "depth", name, p, "all") or {} for p in _PRODUCTS}
+        if all(scores.get("num_compared") for scores in truth.values()):
+            exact = {p: shown_score(scores, "outliers") for p, scores in truth.items()}
             lines.append(f"{name}, outliers against exact truth: {_of_pixels(**exact)}")
+            is_few |= None in exact.values()
     if ghosts := _beside_icp(result, "ghosts", "all"):
         lines.append(f"ghosts of the accumulated points: {ghosts}")
     for name in result.depth:
         for pixels, where in (("all", ""), ("moving", ", on moving objects")):
             scored = ("held_out", name, "measured", pixels)
-            if (look_up(result.metrics, *scored, "num_compared") or 0) < LEAST_PIXELS:
-                continue
-            if outliers := _beside_icp(result, *scored, "outliers"):
-                lines.append(f"{name}, key held out: outliers{where}: {outliers}")
+            if look_up(result.metrics, *scored, "num_compared"):
+                outliers = _beside_icp(result, *scored, "outliers")
+                lines.append(f"{name}, key held out: outliers{where}: {outliers or '-'}")
+                is_few |= not outliers
         if unjudged := look_up(result.metrics, "held_out", name, "unjudged"):
             lines.append(
                 f"{name}, not judged, because the key sweep has no return there: "
                 f"{percent(unjudged['static'])} of static, {percent(unjudged['moving'])} of moving "
                 "pixels"
             )
-    return "\n".join(lines)
+    return "\n".join([*lines, *([f"-: {_FEW_PIXELS}"] if is_few else [])])
 
 
 def _of_pixels(measured: float | None, filled: float | None) -> str:
@@ -191,11 +194,19 @@ def _of_pixels(measured: float | None, filled: float | None) -> str:
 
 def _beside_icp(result: Result, *path: str) -> str:
     """Return a share as text, with that of rigid accumulation in brackets, or "" for no share."""
-    share = look_up(result.metrics, *path)
+    share = _shown(result, *path)
     rigid = result.baselines.get("icp")
-    by_icp = look_up(rigid.metrics, *path) if rigid is not None else None
+    by_icp = _shown(rigid, *path) if rigid is not None else None
     beside = "" if by_icp is None else f" ({percent(by_icp)} with rigid accumulation)"
     return "" if share is None else percent(share) + beside
+
+
+def _shown(result: Result, *path: str) -> float | None:
+    """Return ``metrics[a][b]...``, None if a key is missing or the score is of too few pixels."""
+    scores = look_up(result.metrics, *path[:-1])
+    if isinstance(scores, Mapping) and "num_compared" in scores:
+        return shown_score(scores, path[-1])
+    return look_up(result.metrics, *path)
 
 
 def _key_facts(result: Result) -> dict[str, Any]:
@@ -236,8 +247,11 @@ def _comparison(results: Mapping[str, Result]) -> str:
                     score_path = (truth, camera, "measured", pixels, key)
                     rows.append((f"{camera} {title}, {pixels}, {score}", score_path, form))
     lines = [["", *(METHOD_NAMES.get(name, name) for name in results)]]
+    is_few = False
     for title, path, form in rows:
-        numbers = [look_up(result.metrics, *path) for result in results.values()]
-        if any(number is not None for number in numbers):
+        known = [look_up(result.metrics, *path) for result in results.values()]
+        numbers = [_shown(result, *path) for result in results.values()]
+        is_few |= known != numbers
+        if any(number is not None for number in known):
             lines.append([title, *(written(number, form) for number in numbers)])
-    return aligned(lines)
+    return aligned(lines) + (f"\n-: no score, or {_FEW_PIXELS}" if is_few else "")

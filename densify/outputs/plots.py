@@ -17,7 +17,7 @@ import numpy as np
 from densify.geometry.types import METHOD_NAMES, CameraView, Float, Float32, Result
 from densify.outputs.depth_png import Picture, encode_png
 from densify.outputs.folders import write_file
-from densify.scores.metrics import precision_density
+from densify.scores.metrics import LEAST_PIXELS, precision_density, shown_score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,6 +33,7 @@ _TICKS_M = (3, 5, 10, 20, 40, 80)
 _NO_DEPTH_M = np.float32(1e6)
 _BRIGHTNESS = 0.45
 _MIN_WIDTH_PX = 480
+_TEXT_WIDTH_PX = 1000  # width of a figure from which on its text grows
 _POINT_SIZE_PX = 3
 _TITLE_PX, _SCALE_PX, _BAR_PX, _MARGIN_PX = 36, 60, 15, 12
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
@@ -73,11 +74,14 @@ def order_front_first(
 
 
 def write_figure(path: Path, results: Mapping[str, Result]) -> None:
-    """Write a figure of each method's and the prior's depth ahead, or nothing without maps."""
+    """Write a figure of each method's and the prior's depth ahead, or nothing without maps.
+
+    Below are the other cameras, smaller, with the last method's depth.
+    """
     method, last = list(results.items())[-1]
     if not last.depth:
         return
-    camera = order_front_first([*last.depth], last.views, last.T_key_lidar)[0]
+    camera, *others = order_front_first([*last.depth], last.views, last.T_key_lidar)
     panels = [(METHOD_NAMES.get(m, m), r, "measured") for m, r in results.items()]
     if camera in last.full:
         panels.append((f"{METHOD_NAMES.get(method, method)} and prior", last, "full"))
@@ -85,10 +89,25 @@ def write_figure(path: Path, results: Mapping[str, Result]) -> None:
     camera_name = f", {camera}" if len(last.depth) > 1 else ""
     for title, result, product in panels:
         depth_m = (result.full if product == "full" else result.depth)[camera].depth_m
-        text = f"{title}{camera_name}: {np.count_nonzero(depth_m) / depth_m.size:.1%} of pixels"
+        text = f"{title}{camera_name}: {_density(depth_m)}"
         maps_m[text + _error(result, camera, product)] = depth_m
-    black = np.zeros((*last.depth[camera].depth_m.shape, 3), np.uint8)
-    write_file(path, encode_png(draw_figure(last.images.get(camera, black), maps_m)))
+    of_others = []
+    for name in others:
+        depth_m = last.depth[name].depth_m
+        text = f"{METHOD_NAMES.get(method, method)}, {name}: {_density(depth_m)}"
+        of_others.append((text + _error(last, name, "measured"), _image(last, name), depth_m))
+    write_file(path, encode_png(draw_figure(_image(last, camera), maps_m, of_others)))
+
+
+def _image(result: Result, camera: str) -> Picture:
+    """Return the image (H,W,3) of a map, black if there is none."""
+    shape = *result.depth[camera].depth_m.shape, 3
+    return result.images.get(camera, np.zeros(shape, np.uint8))
+
+
+def _density(depth_m: Float32) -> str:
+    """Return text with the share of pixels that have a depth."""
+    return f"{100 * np.count_nonzero(depth_m) / depth_m.size:.1f} % of pixels"
 
 
 def _error(result: Result, camera: str, product: str) -> str:
@@ -96,28 +115,63 @@ def _error(result: Result, camera: str, product: str) -> str:
     for source, against in (("depth", "truth"), ("held_out", "key held out")):
         scores = (result.metrics.get(source) or {}).get(camera, {}).get(product)
         if scores and scores["all"]["outliers"] is not None:
-            return f", {scores['all']['outliers']:.2%} outliers ({against})"
+            outliers = shown_score(scores["all"], "outliers")
+            if outliers is None:
+                return f", outliers ({against}): fewer than {LEAST_PIXELS} pixels to judge"
+            return f", {100 * outliers:.2f} % outliers ({against})"
     return ""
 
 
-def draw_figure(image: Picture, panels: Mapping[str, Float32]) -> Picture:
+def draw_figure(
+    image: Picture,
+    panels: Mapping[str, Float32],
+    others: Sequence[tuple[str, Picture, Float32]] = (),
+) -> Picture:
     """Return a BGR picture (h,w,3) of panels with depth over a camera's RGB image in gray.
 
-    ``panels`` has title -> (H,W) metres, 0 for no depth, drawn in 3 x 3 pixels, nearest on top,
-    from red at 3 m to blue at 80 m on a logarithmic scale.
+    Depth is drawn in 3 x 3 pixels, nearest on top, from red at 3 m to blue at 80 m on a logarithmic
+    scale.
+
+    Args:
+        image: (H,W,3) image of the first camera.
+        panels: Title -> (H,W) metres, 0 for no depth, drawn below each other.
+        others: Title, image and metres of other cameras, drawn below, two beside each other.
     """
-    kernel = np.ones((_POINT_SIZE_PX, _POINT_SIZE_PX), np.uint8)
-    enlarge = max(1.0, _MIN_WIDTH_PX / image.shape[1])
-    rows = []
-    for title, depth_m in panels.items():
-        nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
-        nearest_m = cv2.erode(nearest_m, kernel).astype(np.float32, copy=False)
-        drawn = depth_over_image(image, np.where(nearest_m < _NO_DEPTH_M, nearest_m, 0))
-        picture = cv2.resize(drawn, None, fx=enlarge, fy=enlarge, interpolation=cv2.INTER_NEAREST)
-        strip = np.full((_TITLE_PX, picture.shape[1], 3), 255, np.uint8)
-        _write(strip, title, _MARGIN_PX, picture.shape[1] - _MARGIN_PX)
-        rows += [strip, picture]
-    return np.concatenate([*rows, _scale(rows[0].shape[1])])
+    width_px = max(image.shape[1], _MIN_WIDTH_PX)
+    text_scale = max(1.0, width_px / _TEXT_WIDTH_PX)
+    rows = [
+        _panel(title, image, depth_m, width_px, text_scale) for title, depth_m in panels.items()
+    ]
+    columns = min(2, max(1, len(others)))
+    cell_px = (width_px - (columns - 1) * _MARGIN_PX) // columns
+    cells = [_panel(*other, cell_px, text_scale) for other in others]
+    for first in range(0, len(cells), columns):
+        beside = cells[first : first + columns]
+        row = np.full((max(len(cell) for cell in beside), width_px, 3), 255, np.uint8)
+        for column, cell in enumerate(beside):
+            left_px = column * (cell_px + _MARGIN_PX)
+            row[: len(cell), left_px : left_px + cell_px] = cell
+        rows.append(row)
+    return np.concatenate([*rows, _scale(width_px, text_scale)])
+
+
+def _panel(
+    title: str, image: Picture, depth_m: Float32, width_px: int, text_scale: float
+) -> Picture:
+    """Return the picture (h,width_px,3) of depth over an image, with its title above."""
+    enlarge = width_px / image.shape[1]
+    # A point is at least 3 x 3 pixels in a smaller picture too.
+    size_px = _POINT_SIZE_PX if enlarge >= 1 else 2 * round(_POINT_SIZE_PX / enlarge / 2) + 1
+    nearest_m = np.where(depth_m > 0, depth_m, _NO_DEPTH_M)
+    nearest_m = cv2.erode(nearest_m, np.ones((size_px, size_px), np.uint8))
+    nearest_m = nearest_m.astype(np.float32, copy=False)
+    drawn = depth_over_image(image, np.where(nearest_m < _NO_DEPTH_M, nearest_m, 0))
+    shape = width_px, max(1, round(enlarge * image.shape[0]))
+    method = cv2.INTER_NEAREST if enlarge >= 1 else cv2.INTER_AREA
+    picture = cv2.resize(drawn, shape, interpolation=method)
+    strip = np.full((round(text_scale * _TITLE_PX), width_px, 3), 255, np.uint8)
+    _write(strip, title, _MARGIN_PX, width_px - _MARGIN_PX, text_scale)
+    return np.concatenate([strip, picture.astype(np.uint8, copy=False)])
 
 
 def depth_over_image(image: Picture, depth_m: Float32) -> Picture:
@@ -141,12 +195,12 @@ def colour_depth(depth_m: Float32) -> Picture:
     return picture
 
 
-def _scale(width_px: int) -> Picture:
+def _scale(width_px: int, text_scale: float) -> Picture:
     """Return the (h,w,3) colour scale with its ticks."""
-    scale = np.full((_SCALE_PX, width_px, 3), 255, np.uint8)
+    scale = np.full((round(text_scale * _SCALE_PX), width_px, 3), 255, np.uint8)
     left = width_px // 20
     bar_width_px = width_px - 2 * left
-    bottom = _MARGIN_PX + _BAR_PX
+    bottom = _MARGIN_PX + round(text_scale * _BAR_PX)
     log_m = np.linspace(np.log(_NEAR_M), np.log(_FAR_M), bar_width_px)
     bar = scale[_MARGIN_PX:bottom, left : left + bar_width_px]
     bar[:] = colour_depth(np.exp(log_m).astype(np.float32)[None])
@@ -154,18 +208,27 @@ def _scale(width_px: int) -> Picture:
     for tick_m in _TICKS_M:
         column = left + int(np.searchsorted(log_m, np.log(tick_m) - 1e-9))
         scale[bottom : bottom + 4, column - 1 : column + 1] = 0
-        _write(scale[bottom:], f"{tick_m} m", column - left, column + left, centred=True)
+        sides = column - left, column + left
+        _write(scale[bottom:], f"{tick_m} m", *sides, text_scale, centred=True)
     return scale
 
 
-def _write(strip: Picture, text: str, left_px: int, right_px: int, centred: bool = False) -> None:
+def _write(
+    strip: Picture,
+    text: str,
+    left_px: int,
+    right_px: int,
+    text_scale: float,
+    centred: bool = False,
+) -> None:
     """Write a line of text into the middle of a strip (h,w,3), smaller if it is too long."""
-    (width_px, height_px), _ = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)
+    size, stroke_px = text_scale * _FONT_SCALE, round(text_scale)
+    (width_px, height_px), _ = cv2.getTextSize(text, _FONT, size, stroke_px)
     shrink = min(1.0, (right_px - left_px) / width_px)
     if centred:
         left_px = (left_px + right_px - round(shrink * width_px)) // 2
     at = left_px, (strip.shape[0] + height_px) // 2
-    cv2.putText(strip, text, at, _FONT, shrink * _FONT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(strip, text, at, _FONT, shrink * size, (0, 0, 0), stroke_px, cv2.LINE_AA)
 
 
 class Dot(NamedTuple):

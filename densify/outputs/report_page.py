@@ -30,6 +30,7 @@ from densify.outputs.finished_run import map_names, read_scene, read_tracks
 from densify.outputs.folders import mapping_or_empty, plain, write_file
 from densify.outputs.plots import order_front_first
 from densify.readers.decoded_files import decode_image
+from densify.scores.metrics import LEAST_PIXELS
 from densify.version import __version__
 
 T = TypeVar("T")
@@ -170,6 +171,7 @@ def key_page(files: KeyFiles, shown_folder: str) -> bytes:
         "footer": f"densify {__version__}; this file needs nothing but itself.",
         "folder": shlex.quote(shown_folder) if shown_folder else "",
         "key": key,
+        "least_pixels": LEAST_PIXELS,
         "method": methods[-1],
         "methods": files.methods,
         "cameras": cameras,

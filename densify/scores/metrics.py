@@ -7,7 +7,7 @@ Errors of depth follow KITTI's development kit (Uhrig et al., 3DV 2017).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -26,7 +26,7 @@ OUTLIER_FRACTION = 0.05
 DECADES = 5.0
 """Confidence 1 means one outlier in 10^5 pixels; each 0.2 less means ten times as many."""
 LEAST_PIXELS = 200
-"""A share of fewer compared pixels is no result, and is not shown."""
+"""A share of fewer pixels is no result, and is not shown."""
 _DELTA = 1.25
 _RANGES_M = (0, 10, 20, 30, 50, 80)
 _EDGE_PX = 3
@@ -104,6 +104,12 @@ def depth_errors(
         outliers_1_px=mean_or_none(focal_px * baseline_m * np.abs(1 / z - 1 / t) > 1),
         silog=float(np.std(np.log(z / t))) if num_compared else None,
     )
+
+
+def shown_score(scores: Mapping[str, Any], name: str) -> float | None:
+    """Return a score of a mapping of `DepthErrors`, None if fewer than 200 pixels count in it."""
+    num_pixels = scores.get("num_pixels" if name == "coverage" else "num_compared")
+    return scores.get(name) if (num_pixels or 0) >= LEAST_PIXELS else None
 
 
 def precision_density(

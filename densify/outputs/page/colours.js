@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT
-// Colour maps that colour-blind people can read, and their legends. Turbo, which they read less
-// well, is there for its many hues and never the default.
+// Colour maps and their legends. Depth is red (near) to blue (far) by default, as in figure.png and
+// the docs: turbo. Colour-blind people read it less well, so viridis and cividis are in the menu.
 
 const palettes = Object.fromEntries(
   Object.entries(page.palettes).map(([name, text]) => [

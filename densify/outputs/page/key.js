@@ -7,7 +7,7 @@ function facts() {
   const camera = Object.keys(page.cameras)[0], entry = page.cameras[camera];
   if (entry) fact("pixels with a depth", percent(entry.density.filled, 1), `${percent(entry.density.measured, 1)} measured, ${camera}`);
   for (const [source, name] of [["depth", "outliers, against the truth"], ["held_out", "outliers, key held out"]]) {
-    const wrong = (m) => page.methods[m]?.[source]?.[camera]?.measured?.all?.outliers;
+    const wrong = (m) => shownScore(page.methods[m]?.[source]?.[camera]?.measured?.all, "outliers");
     if (isNumber(wrong(page.method))) fact(name, percent(wrong(page.method)), page.method !== "icp" && isNumber(wrong("icp")) ? `${percent(wrong("icp"))} with rigid accumulation` : "measured pixels");
   }
   if (isNumber(scores.ghosts?.all)) {
@@ -24,6 +24,7 @@ function facts() {
 }
 
 function warnings() {
+  if (!page.warnings.length) $("warnings").append(element("p", { class: "small" }, "There are no warnings."));
   for (const warning of page.warnings) $("warnings").append(element("p", { class: "note" }, warning));
   $("footer").textContent = page.footer;
 }

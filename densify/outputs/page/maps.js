@@ -85,8 +85,9 @@ class CameraMaps {
       product: r.product,
       density: r.num / this.size,
       expected: this.confidence && r.num ? r.expected / r.num : null,
-      outliers: r.compared ? r.wrong / r.compared : null,
-      maeM: r.compared ? (r.off / r.compared) * M_PER_STEP : null,
+      isFew: r.compared > 0 && r.compared < page.least_pixels,
+      outliers: r.compared >= page.least_pixels ? r.wrong / r.compared : null,
+      maeM: r.compared >= page.least_pixels ? (r.off / r.compared) * M_PER_STEP : null,
     }));
   }
   // [[name, text], ...] of what can be looked at.
@@ -197,7 +198,7 @@ class ImagePane {
     this.at = null;
     this.drawing = false;
     fillSelect($("camera"), names.map((n) => [n, n]));
-    fillSelect($("palette"), [["viridis", "viridis"], ["cividis", "cividis"], ["turbo", "turbo (many hues)"]], "viridis");
+    fillSelect($("palette"), [["turbo", "red to blue (turbo)"], ["viridis", "viridis"], ["cividis", "cividis"]], "turbo");
     for (const id of ["left", "right", "palette", "enlarge"]) $(id).addEventListener("change", () => this.draw());
     for (const id of ["confidence", "age"]) $(id).addEventListener("input", () => this.soon());
     $("camera").addEventListener("change", () => section("The image", () => this.open($("camera").value)));
@@ -212,7 +213,7 @@ class ImagePane {
     this.maps = await CameraMaps.of(name, page.cameras[name]);
     const layers = this.maps.layers(), has = (l) => layers.some(([n]) => n === l);
     const [left, right] = [$("left").value, $("right").value];
-    fillSelect($("left"), layers, has(left) ? left : has("none") ? "none" : layers[0][0]);
+    fillSelect($("left"), layers, has(left) ? left : ["icp", "none"].find(has) || layers[0][0]);
     fillSelect($("right"), layers, has(right) ? right : "measured");
     const most = Math.max(this.maps.oldestMs, 1);
     const all = Number($("age").value) >= Number($("age").max) || !this.opened;
@@ -333,7 +334,7 @@ class ImagePane {
     );
     const curve = heldOutAt(maps.name, confidence);
     const held = isNumber(curve) ? `With the key sweep held out, ${percent(curve)} of the measured pixels this certain are outliers.` : "";
-    $("kept-note").textContent = held;
+    $("kept-note").textContent = rows.some((r) => r.isFew) ? `${FEW_PIXELS} ${held}` : held;
     const age = ageMs === Infinity ? "" : ` --max-age-ms ${ageMs}`;
     $("export-command").parentElement.hidden = !page.folder;
     $("export-command").textContent = page.folder ? `densify export ${page.folder} --to npy --min-confidence ${confidence}${age}` : "";
