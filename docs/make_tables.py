@@ -46,6 +46,7 @@ TITLES = dict(
         strict=True,
     )
 )
+HELD_OUT = ("rigid (ICP)", "rigid cleaned", "densify measured", "densify filled")
 TRUTHS = {
     "KITTI, stereo": ("KITTI, 1 image, stereo truth", ["0013@10"]),
     "PandaSet, second scanner": ("PandaSet, 3 images, second scanner", []),
@@ -113,6 +114,21 @@ def rows_of_truths(errors: Any, methods: Sequence[str], stored: gate.Stored | No
             label_of_row = label if part == "all" else "its moving pixels"
             rows.append([label_of_row, *(marked[method] for method in methods)])
     return table(["outliers in % (coverage)", *(TITLES[m] for m in methods)], rows)
+
+
+def many_keys(held_out: Any) -> str:
+    """Return the table of recordings whose keys are held out, with standard errors over keys."""
+    rows = []
+    for label, methods in held_out.items():
+        for part, title in (("all", label), ("moving", "its moving pixels")):
+            cells = [methods[method][part] for method in HELD_OUT]
+            texts = []
+            for cell in cells:
+                text = f"{100 * cell['outliers']:.2f} ± {100 * cell['error']:.2f}"
+                is_known = cell["num_compared"] >= LEAST_PIXELS
+                texts.append(f"{text} ({cell['coverage']:.2f})" if is_known else "–")
+            rows.append([title, *texts])
+    return table(["outliers in % (coverage)", *HELD_OUT], rows)
 
 
 def judged(errors: Any, stored: gate.Stored) -> str:
@@ -377,6 +393,8 @@ def with_tables(page: str) -> str:
             text = short_cost(numbers["cost"])
         elif name in of_code:
             text = of_code[name]()
+        elif name == "many_keys":
+            text = many_keys(numbers["held_out"])
         elif name in of_training:
             text = of_training[name](numbers["training"])
         else:
