@@ -21,6 +21,7 @@ from densify.readers import describe, open_sequence
 from densify.readers.folder import Folder
 from densify.readers.folder_config import FolderConfig
 from densify.readers.kitti import KittiRaw
+from densify.readers.kitti_files import Calibration
 from densify.readers.street import Street
 from tests.command import exit_code
 from tests.dataset_scenes import copy_drive
@@ -342,6 +343,22 @@ def test_the_documented_example_is_right(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "your-recording.md").read_text("utf-8")
     read = FolderConfig.read(config(tmp_path, text.split("```yaml\n")[1].split("```")[0]))
     assert read.sweeps.time == "t" and read.cameras["front"].K[0, 0] == 1000
+
+
+def test_the_documented_chain_of_calibrations_is_right(border_drive):
+    text = (Path(__file__).parents[1] / "docs" / "your-recording.md").read_text("utf-8")
+    (chain,) = (block for block in text.split("```")[1::2] if "T_cam_rect @" in block)
+    names = {"np": np}
+    for file, shapes in {
+        "calib_velo_to_cam.txt": {"R": (3, 3), "T": (3,)},
+        "calib_cam_to_cam.txt": {"R_rect_00": (3, 3), "P_rect_02": (3, 4)},
+    }.items():
+        calibration = Calibration.read(border_drive.parent / file)
+        names |= {key: calibration.numbers(key, *shape) for key, shape in shapes.items()}
+    exec(chain.removeprefix("python\n"), names)
+    camera = KittiRaw(border_drive).cameras["image_02"]
+    np.testing.assert_allclose(names["T_cam_lidar"], camera.T_cam_lidar, atol=1e-9)
+    np.testing.assert_allclose(names["P_rect_02"][:, :3], camera.K, atol=1e-9)
 
 
 # --- damage ---------------------------------------------------------------------------------------
