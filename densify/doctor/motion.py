@@ -7,6 +7,7 @@ scanner at its firing.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -50,6 +51,7 @@ _NEAR_M = 25.0  # range of the returns that show the ground, and that are compar
 # Returns of the ego vehicle
 _CELL_M, _CLOSE_M = 0.1, 6.0  # side of a cell in which sweeps agree; reach of the vehicle
 _LEAST_RETURNS, _LEAST_HEIGHT_M, _DRIVING_M_S = 20, 0.4, 1.0
+_NEARLY_ALL = 0.9  # least share of the sweeps that agree in a cell
 _WIDEST_M = 2.6  # width of a road vehicle; kerbs and rails stay beside it too, but farther out
 _LEAST_WITHOUT = 0.005  # least reported share of rows without a return
 # Deskewing: distances between the first and the last sweep of a spot
@@ -186,16 +188,17 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
 
 def _own_returns(spots: list[Spot]) -> Float:
     """Return the returns (N,3) of the ego vehicle in one sweep, metres, rounded to 0.1 m cells."""
-    # All sweeps have returns of it in the same cells. By chance two sweeps have returns of a long
-    # hedge or rail in the same cells, but not all.
+    # Nearly all sweeps have returns of it in the same cells. A few sweeps also have returns of a
+    # hedge or rail along the road in the same cells, by chance.
     R_level_lidar = find_upright([spot.sweeps[0] for spot in spots])
     cells_of_sweep = []  # for each sweep, the cell of each return
     for spot in spots:
         for sweep in spot.sweeps:
             candidates = _own_candidates(sweep.points, spot.twist, R_level_lidar)
             cells_of_sweep.append([*map(tuple, np.floor(candidates / _CELL_M).astype(np.int64))])
-    common_cells = set.intersection(*map(set, cells_of_sweep))
-    own_cells = [cell for cell in cells_of_sweep[0] if cell in common_cells]
+    num_sweeps = Counter(cell for cells in cells_of_sweep for cell in set(cells))
+    least = _NEARLY_ALL * len(cells_of_sweep)
+    own_cells = [cell for cell in cells_of_sweep[0] if num_sweeps[cell] >= least]
     return (np.array(own_cells).reshape(-1, 3) + 0.5) * _CELL_M  # middles of the cells
 
 
