@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -198,6 +199,40 @@ def test_a_turned_camera_is_told_with_the_line_that_mends_it(
         assert np.linalg.norm(left_deg) < 0.6 and np.linalg.norm(left_deg[:2]) < 0.3
 
 
+def test_an_inverted_calibration_is_told_with_the_right_rows(exact: Sample) -> None:
+    camera = exact.sequence.cameras["fast"]
+    views, _ = cameras.camera_views(exact, camera, {})
+    inverted = replace(camera, T_cam_lidar=poses.inverse(camera.T_cam_lidar))
+    (told,) = cameras.check_calibration(inverted, views)
+    assert told.verdict == Verdict.WRONG and "the inverse of the given pose" in told.evidence
+    rows = yaml.safe_load(told.remedy)["T_cam_lidar"]
+    np.testing.assert_allclose(rows, camera.T_cam_lidar[:3], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("share_z", "share_y", "verdict", "says"),
+    [
+        (0.18, 0.27, Verdict.FINE, "8 % are enough for a road; a wall or hedge explains the 27 %"),
+        (0.09, 0.4, Verdict.UNKNOWN, "40 % .* if y is up, 9 % if z is: both may be the ground"),
+        (0.02, 0.3, Verdict.WRONG, r"30 % .* if y is up, 2 % if z is \(y up\)"),
+    ],
+)
+def test_another_axis_with_a_larger_layer(
+    good: Sample, monkeypatch, share_z, share_y, verdict, says
+) -> None:
+    shares = [share_y, share_z]
+    monkeypatch.setattr(stored, "_ground_share", lambda _, up: max(0.0, up[1:] @ shares))
+    (axes,) = stored.check_axes(good)
+    assert axes.verdict == verdict and re.search(says, axes.evidence)
+
+
+def test_rings_that_are_sharpest_beside_the_given_place_say_why_that_is_fine(good: Sample) -> None:
+    higher = with_sweeps(good, lambda s: replace(s, points=s.points + [0, 0, 0.2]))
+    place = motion.check_rings(higher)[0]
+    assert place.verdict == Verdict.FINE
+    assert "0.20 m off, and up to 0.3 m is no error" in place.evidence
+
+
 def passing(yaw_deg: float, late_s: float, is_fence: bool) -> tuple[Camera, list[View]]:
     """Boards 20 m beside a straight road, or anywhere there, in a camera that looks at them."""
     T_cam_lidar = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
@@ -277,12 +312,20 @@ def with_box(low, high):
     return with_points(np.random.default_rng(0).uniform(low, high, (2000, 3)))
 
 
+def with_hedge(sweep: Sweep) -> Sweep:
+    """Replace points by returns of a hedge, some in the same place in a few sweeps by chance."""
+    low, high = [-5.0, -2.59, -0.9], [5.0, -2.4, -0.2]
+    points = np.random.default_rng(sweep.frame).uniform(low, high, (800, 3))
+    return with_points(points)(sweep)
+
+
 @pytest.mark.parametrize(
     ("change", "least_m"),
     [
         (lambda sweep: sweep, None),
         (with_box([3.6, -0.5, -0.4], [3.9, 0.5, -0.3]), 3.9),  # a hood
         (with_box([-4.5, 3.0, -1.2], [4.5, 3.4, -1.1]), None),  # a kerb along the road
+        (with_hedge, None),
         (with_road(6, 0), None),
         (with_road(3, 0), None),
         (with_road(0, 300), None),

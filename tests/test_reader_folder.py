@@ -15,11 +15,13 @@ from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
 from densify.geometry.poses import inverse
+from densify.geometry.turns import share_of_turn
 from densify.outputs.simulated_street import config_text
 from densify.readers import describe, open_sequence
 from densify.readers.folder import Folder
 from densify.readers.folder_config import FolderConfig
 from densify.readers.kitti import KittiRaw
+from densify.readers.kitti_files import Calibration
 from densify.readers.street import Street
 from tests.command import exit_code
 from tests.dataset_scenes import copy_drive
@@ -197,6 +199,65 @@ def test_compensation_is_undone_with_stamped_poses(tmp_path):
     assert "left out" in dict(sequence.findings())["times"]
 
 
+@pytest.mark.parametrize(
+    ("keys", "first_deg", "first_ms"),
+    [
+        ("turn: anticlockwise, reference: start", 180, 0),  # the order of the points of scan()
+        ("turn: anticlockwise, reference: start, start_deg: -180", 180, 0),
+        ("turn: anticlockwise, reference: end, start_deg: 90", 90, -100),
+        ("turn: anticlockwise", 180, -50),
+        ("start_deg: 90, reference: start, rate_hz: 20", 90, 0),
+    ],
+)
+def test_times_by_azimuth(keys, first_deg, first_ms, tmp_path):
+    """A scanner at (1, 2, 0), whose file has a column of times that are not used."""
+    azimuth_deg = np.rad2deg(np.arctan2(*scan().astype(float).T[1::-1]))
+    sign, turn_ms = (1 if "anti" in keys else -1), (50 if "20" in keys else 100)
+    share = np.round(sign * (azimuth_deg - first_deg) / 360, 6) % 1
+    expected_ms = first_ms + share * turn_ms
+    table = np.column_stack([scan() + [1, 2, 0], np.linspace(0, 0.0999, 600)])
+    bare(tmp_path, ["0.bin", "1.bin"], table)
+    (tmp_path / "timestamps.txt").write_text("0.0\n0.1\n")
+    text = f"columns: [x, y, z, time], time: azimuth, scanner_origins: [[1, 2, 0]], {keys}"
+    sequence = Folder(config(tmp_path, f"sweeps: {{{text}}}\n"))
+    off_ms = sequence[1].offset_ns * 1e-6 - expected_ms
+    off_ms[np.abs(share - np.rint(share)) < 1e-5] = 0  # the first is as well the last
+    np.testing.assert_allclose(off_ms, 0, atol=1e-3)
+    assert "by azimuth" in dict(sequence.findings())["times"]
+
+
+def test_times_by_azimuth_undo_a_compensation(tmp_path):
+    """At 10 m/s along x, as KITTI's odometry stores its sweeps, or placed in a map."""
+    fired = scan().astype(float)
+    time_s = 0.1 * share_of_turn(fired)
+    stored = fired + time_s[:, None] * [10.0, 0, 0]
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n0.2 2 0 0 0 0 0 1\n")
+    for moved_m, key in ((0.0, "compensated: true"), (1.0, "frame: poses")):
+        bare(tmp_path, ["0.bin", "1.bin"], np.column_stack([stored + [moved_m, 0, 0], time_s]))
+        sequence = Folder(config(tmp_path, f"sweeps: {{time: azimuth, {key}}}\n"))
+        inside = np.abs(time_s) < 0.049  # the first and the last are neighbours
+        np.testing.assert_allclose(sequence[1].points[inside], fired[inside], atol=1e-3)
+        np.testing.assert_allclose(sequence[1].offset_ns[inside] * 1e-9, time_s[inside], atol=1e-4)
+
+
+def test_times_by_azimuth_are_those_of_a_kitti_drive(border_drive, tmp_path):
+    check_times_of(border_drive, tmp_path)
+
+
+def check_times_of(drive: Path, folder: Path) -> None:
+    """Check that the sweeps of a KITTI drive in a plain folder have the times of the drive."""
+    known = KittiRaw(drive)
+    velodyne = drive / "velodyne_points"
+    lines = (velodyne / "timestamps.txt").read_text().splitlines()
+    (folder / "timestamps.txt").write_text("\n".join(lines[frame] for frame in known.frames))
+    for path in (velodyne / "data").iterdir():
+        (folder / path.name).symlink_to(path)
+    plain = Folder(config(folder, "sweeps: {time: azimuth}\n"))
+    for frame in known.frames[:: len(known.frames) // 3]:
+        assert plain.stamp_ns(frame) == known.stamp_ns(frame)
+        np.testing.assert_allclose(plain[frame].offset_ns, known[frame].offset_ns, atol=100_000)
+
+
 @pytest.mark.parametrize("timed", [True, False])
 def test_sweeps_in_the_frame_of_their_poses_are_taken_back(timed, tmp_path):
     """Each point was placed with the pose of its moment; without times, with that of the stamp."""
@@ -284,6 +345,22 @@ def test_the_documented_example_is_right(tmp_path):
     assert read.sweeps.time == "t" and read.cameras["front"].K[0, 0] == 1000
 
 
+def test_the_documented_chain_of_calibrations_is_right(border_drive):
+    text = (Path(__file__).parents[1] / "docs" / "your-recording.md").read_text("utf-8")
+    (chain,) = (block for block in text.split("```")[1::2] if "T_cam_rect @" in block)
+    names = {"np": np}
+    for file, shapes in {
+        "calib_velo_to_cam.txt": {"R": (3, 3), "T": (3,)},
+        "calib_cam_to_cam.txt": {"R_rect_00": (3, 3), "P_rect_02": (3, 4)},
+    }.items():
+        calibration = Calibration.read(border_drive.parent / file)
+        names |= {key: calibration.numbers(key, *shape) for key, shape in shapes.items()}
+    exec(chain.removeprefix("python\n"), names)
+    camera = KittiRaw(border_drive).cameras["image_02"]
+    np.testing.assert_allclose(names["T_cam_lidar"], camera.T_cam_lidar, atol=1e-9)
+    np.testing.assert_allclose(names["P_rect_02"][:, :3], camera.K, atol=1e-9)
+
+
 # --- damage ---------------------------------------------------------------------------------------
 
 WRONG_CONFIGS = [
@@ -294,6 +371,8 @@ WRONG_CONFIGS = [
     ("sweeps: {scale_m: full}", "got 'full', expected a finite number above 0"),
     ("sweeps: {columns: [x, y, z, i, a, b, c]}", "multiple of 28"),
     ("sweeps: {time: tee}", r"sweeps\.time: got 'tee', expected a column of 0\.bin"),
+    ("sweeps: {turn: clockwise}", r"sweeps\.turn: only times by azimuth use it: time: azimuth"),
+    ("sweeps: {time: azimuth, turn: left}", "got 'left', expected one of clockwise, anticlockwise"),
     ("sweeps: {lidar: intensity}", "expected the number of a scanner, 0 to 255"),
     ("sweeps: {scanner_origins: [[0, 0]]}", r"sweeps\.scanner_origins: .* shape \(N, 3\)"),
     ("sweeps: {stamps: names}", "its name is no time"),
@@ -303,6 +382,12 @@ WRONG_CONFIGS = [
 CAMERA_EDITS = [
     ("K: [9, 9", "K: [0, 9", "with fx and fy above 0"),
     ("K: [9, 9", "K: [fx, 9", r"front\.K: got .*expected .fx, fy"),
+    ("[1, 0, 0, 0]]", "[1, 0, 0]]", r"front\.T_cam_lidar: .*; row 3 has 3 numbers, not 4"),
+    (
+        "[[0, -1, 0, 0]",
+        "[[0.5, -1, 0, 0]",
+        r"front\.T_cam_lidar: .*not a rotation \(R R. is off by",
+    ),
     ("[[0, -1, 0, 0]", "[[0.5, -1, 0, 0]", r"front\.T_cam_lidar: .*three or four rows"),
     ("fisheye, distortion: [0, 0, 0, 0]", "pinhole, distortion: [1, 2]", "0, 4, 5, 8, 12, 14 co"),
     ("files: a,", "files: nowhere,", "no images, though densify"),
@@ -400,7 +485,9 @@ def test_a_folder_that_is_no_recording_says_what_is_there(border_drive, tmp_path
 
 def test_the_sweeps_of_a_drive_alone_say_what_is_lost(border_drive):
     for place in (border_drive / "velodyne_points", border_drive / "velodyne_points" / "data"):
-        told = "\n".join(open_sequence(place).gaps())
+        sequence = open_sequence(place)
+        assert f"the KITTI drive {border_drive}, which has more: name that" in describe(sequence)
+        told = "\n".join(sequence.gaps())
         assert f"is a part of the KITTI drive {border_drive}: read alone it has no times" in told
 
 
@@ -420,7 +507,7 @@ def test_a_drive_that_is_a_link_has_the_calibration_beside_it(border_drive, tmp_
 # --- real sweeps ----------------------------------------------------------------------------------
 
 
-def test_real_sweeps_without_a_word_beside_them(test_data):
+def test_real_sweeps_without_a_word_beside_them(test_data, tmp_path):
     kitti = open_sequence(test_data / "kitti_odometry/sequences/00/velodyne")
     assert len(kitti.frames) == 3 and kitti[0].points.shape == (124_668, 3)
     raw = test_data / "kitti/2011_09_26/2011_09_26_drive_0013_sync"
@@ -428,3 +515,4 @@ def test_real_sweeps_without_a_word_beside_them(test_data):
     assert list(plain.frames) == list(known.frames)
     np.testing.assert_array_equal(plain[100].points, known[100].points)
     assert [plain.stamp_ns(f) for f in plain.frames] == [known.stamp_ns(f) for f in known.frames]
+    check_times_of(raw, tmp_path)

@@ -263,7 +263,10 @@ def test_a_set_ends_with_its_warnings_and_keeps_them(border_drive, tmp_path, cap
     settings = (*OPTIONS, "--layout", "densify", "--method", "icp", "--keys", "36:39")
     assert exit_code("dataset", "--data", drive, *settings, "--out", out) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
-    untimed = "the points have no times of their own: motion within a sweep is not undone"
+    untimed = (
+        "the points have no times of their own: motion within a sweep is not undone, and unless "
+        "that was done before, confidence is low on purpose; densify doctor says what to do"
+    )
     lacks = f"{drive / 'velodyne_points'} has no timestamps_start.txt"
     begin = f"densify: warning: {drive.name} key 36-38: "
     assert told[:2] == [begin + lacks, begin + untimed]

@@ -152,12 +152,12 @@ def check_calibration(camera: Camera, views: list[View]) -> list[Finding]:
 
     with_clock = any(np.linalg.norm(view.twist[3:]) > _LEAST_SPEED_M_S for view in views)
     fit = best_fit(camera, views, with_clock)
-    mistake, mistake_score = _best_mistake(camera, views)
+    mistake, mistake_score, T_corrected = _best_mistake(camera, views)
     values = {"score": fit.score, "clearness": fit.clearness, "other": mistake_score}
     values |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), fit.offset.tolist(), strict=False))
     if mistake_score > _CLEARLY * max(fit.score, fit.rival, 0.0):
         text = f"depth discontinuities lie on image edges with {mistake}, and not as given"
-        return [Finding(name, WRONG, text, f"give {mistake}", values)]
+        return [Finding(name, WRONG, text, _line_of(camera.name, T_corrected), values)]
 
     explanations = [_best_explanation(fit, with_clock), *map(_explanation, fit.others)]
     # Offsets that fit equally matter unless the best fit changes less than each of them.
@@ -213,20 +213,25 @@ def _report_offset(
         text += f"; more changes at once fit about equally: {'; or '.join(explanations[1:])}"
     # Angles that are 0 within two standard errors are left as they are.
     corrected = turned(camera, np.where(np.abs(fit.offset) > 2 * fit.error, fit.offset, 0.0))
-    where = f"cameras.{camera.name} in densify.yaml, or the recording's own calibration file"
-    remedy = f"T_cam_lidar: {corrected.T_cam_lidar[:3].round(5).tolist()}  # {where}"
+    remedy = _line_of(camera.name, corrected.T_cam_lidar)
     return Finding(f"{camera.name}: calibration", verdict, text, remedy, values)
 
 
-def _best_mistake(camera: Camera, views: list[View]) -> tuple[str, float]:
-    """Return the common mistake whose correction scores best, and its score."""
+def _line_of(name: str, T_cam_lidar: Float) -> str:
+    """Return the line of a corrected calibration (4,4), and where it belongs."""
+    where = f"cameras.{name} in densify.yaml, or the recording's own calibration file"
+    return f"T_cam_lidar: {T_cam_lidar[:3].round(5).tolist()}  # {where}"
+
+
+def _best_mistake(camera: Camera, views: list[View]) -> tuple[str, float, Float]:
+    """Return the common mistake whose correction scores best, its score, and the correction."""
     num_given = score(camera, views)[1]
-    scores = {}
-    for mistake, T_cam_lidar in correct_common_mistakes(camera.T_cam_lidar).items():
+    scores, corrected = {}, correct_common_mistakes(camera.T_cam_lidar)
+    for mistake, T_cam_lidar in corrected.items():
         mistake_score, num_edges = score(replace(camera, T_cam_lidar=T_cam_lidar), views)
         scores[mistake] = mistake_score if num_edges > _LEAST_EDGES * num_given else 0.0
     best = max(scores, key=lambda mistake: scores[mistake])
-    return best, scores[best]
+    return best, scores[best], corrected[best]
 
 
 def _best_explanation(fit: Fit, with_clock: bool) -> str:

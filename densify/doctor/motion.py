@@ -7,6 +7,7 @@ scanner at its firing.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -16,7 +17,16 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from densify.config.errors import InputError
-from densify.doctor.sample import FINE, SUSPICIOUS, UNKNOWN, WRONG, Finding, Sample, Spot
+from densify.doctor.sample import (
+    FINE,
+    GIVE_TIMES,
+    SUSPICIOUS,
+    UNKNOWN,
+    WRONG,
+    Finding,
+    Sample,
+    Spot,
+)
 from densify.free_space.ground import HeightMap, find_upright
 from densify.free_space.raw_sweeps import MAP_FRAME_REMEDY, is_still, way_in_map
 from densify.free_space.sensor import SensorModel, Sensors
@@ -41,6 +51,7 @@ _NEAR_M = 25.0  # range of the returns that show the ground, and that are compar
 # Returns of the ego vehicle
 _CELL_M, _CLOSE_M = 0.1, 6.0  # side of a cell in which sweeps agree; reach of the vehicle
 _LEAST_RETURNS, _LEAST_HEIGHT_M, _DRIVING_M_S = 20, 0.4, 1.0
+_NEARLY_ALL = 0.9  # least share of the sweeps that agree in a cell
 _WIDEST_M = 2.6  # width of a road vehicle; kerbs and rails stay beside it too, but farther out
 _LEAST_WITHOUT = 0.005  # least reported share of rows without a return
 # Deskewing: distances between the first and the last sweep of a spot
@@ -146,7 +157,7 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
     """Check that ``register.min_range_m`` drops all returns of the ego vehicle.
 
     These returns keep their position in the lidar frame while the vehicle drives. The verdict is
-    SUSPICIOUS if some lie beyond that range, UNKNOWN if the vehicle drives in fewer than two spots.
+    SUSPICIOUS if many lie beyond that range, UNKNOWN if the vehicle drives in fewer than two spots.
     """
     driving_spots = [
         spot
@@ -158,11 +169,14 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
         text = f"the vehicle drives in {len(driving_spots)} of the places looked at, two are needed"
         return [Finding("own vehicle", UNKNOWN, text)]
     range_m = np.linalg.norm(_own_returns(driving_spots), axis=1)
-    num_returns = len(range_m)
     min_range_m = sample.settings.min_range_m
-    # The farthest 1 % may be chance returns.
+    # A few returns, and the farthest 1 %, may be chance returns: a kerb has some in the same cells.
+    num_beyond = int((range_m > min_range_m).sum())
+    is_beyond = num_beyond >= _LEAST_RETURNS and num_beyond > 0.01 * len(range_m)
+    range_m = range_m if is_beyond else range_m[range_m <= min_range_m]
+    num_returns = len(range_m)
     farthest_m = float(np.percentile(range_m, 99)) if num_returns else 0.0
-    where, verdict = ("beyond", SUSPICIOUS) if farthest_m > min_range_m else ("all within", FINE)
+    where, verdict = (f"{num_beyond} beyond", SUSPICIOUS) if is_beyond else ("within", FINE)
     text = f"{num_returns} returns a sweep, at most {farthest_m:.1f} m away, {where} "
     text += f"register.min_range_m = {min_range_m:g}"
     if num_returns < _LEAST_RETURNS:
@@ -174,15 +188,17 @@ def check_own_vehicle(sample: Sample) -> list[Finding]:
 
 def _own_returns(spots: list[Spot]) -> Float:
     """Return the returns (N,3) of the ego vehicle in one sweep, metres, rounded to 0.1 m cells."""
-    # The first and the last sweep of each spot have returns of it in the same cells.
+    # Nearly all sweeps have returns of it in the same cells. A few sweeps also have returns of a
+    # hedge or rail along the road in the same cells, by chance.
     R_level_lidar = find_upright([spot.sweeps[0] for spot in spots])
     cells_of_sweep = []  # for each sweep, the cell of each return
     for spot in spots:
-        for sweep in _ends(spot):
+        for sweep in spot.sweeps:
             candidates = _own_candidates(sweep.points, spot.twist, R_level_lidar)
             cells_of_sweep.append([*map(tuple, np.floor(candidates / _CELL_M).astype(np.int64))])
-    common_cells = set.intersection(*map(set, cells_of_sweep))
-    own_cells = [cell for cell in cells_of_sweep[0] if cell in common_cells]
+    num_sweeps = Counter(cell for cells in cells_of_sweep for cell in set(cells))
+    least = _NEARLY_ALL * len(cells_of_sweep)
+    own_cells = [cell for cell in cells_of_sweep[0] if num_sweeps[cell] >= least]
     return (np.array(own_cells).reshape(-1, 3) + 0.5) * _CELL_M  # middles of the cells
 
 
@@ -231,8 +247,11 @@ def check_deskewing(sample: Sample) -> list[Finding]:
     if min(reversed_m, without_m) * _CLEARLY_NEARER < given_m:
         verdict = WRONG
     elif given_m * _NEARER >= min(reversed_m, without_m):
-        verdict, note = UNKNOWN, ": too slow here to tell"
-    remedy = "correct the sign of the point times, or --set register.deskew=false"
+        verdict, note = UNKNOWN, ": too alike to tell"
+    remedy = (
+        "correct the sign of the point times (of times by azimuth, sweeps: {turn: anticlockwise}), "
+        "or --set register.deskew=false"
+    )
     return [Finding("deskewing", verdict, text + note, remedy, values)]
 
 
@@ -303,8 +322,15 @@ def _check_origin(name: str, points: Float, R: Float, origins_m: tuple[Float, Fl
     verdict, note = FINE, ""
     if best_sharpness < LEAST_SHARPNESS:
         verdict, note = UNKNOWN, "; no distinct rings"
-    elif off_m > _OFF_M and best_sharpness > CLEARLY * given_sharpness:
+    elif best_sharpness <= CLEARLY * given_sharpness:
+        note = "; not clearly sharper, so the given place fits" if off_m else ""
+    elif off_m > _OFF_M:
         verdict = WRONG
+    else:
+        note = (
+            f"; {off_m:.2f} m off, and up to {_OFF_M:g} m is no error: rings of scanners with two "
+            f"blocks of lasers, such as the HDL-64E, are sharpest beside the place"
+        )
     remedy = f"give the scanner's place in the points' frame ({line})"
     return Finding(name, verdict, text + note, remedy, values)
 
@@ -383,7 +409,7 @@ def _check_compensation(
     elif rings.as_stored < CLEARLY * rings.undone:
         verdict, note = UNKNOWN, ": too alike to tell"
     elif is_untimed:
-        verdict, remedy = SUSPICIOUS, "give the points times (a column t in the files)"
+        verdict, remedy = SUSPICIOUS, GIVE_TIMES
         note = (
             f": the sweeps are as they were fired and no point has a time, so they stay stretched "
             f"by {spot.speed_m_s * period_s:.2f} m"

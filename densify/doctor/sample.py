@@ -35,6 +35,12 @@ class Verdict(IntEnum):
 
 
 FINE, UNKNOWN, SUSPICIOUS, WRONG = Verdict
+GIVE_TIMES = (
+    "give them times: a column in the files, or for a scanner that spins the line sweeps: {time: "
+    "azimuth} in the densify.yaml of a folder"
+)
+"""Remedy of sweeps whose points have no times."""
+
 Value = float | int | str | list[float]
 
 

@@ -91,7 +91,10 @@ def _warn_of_sweeps(recording: Recording, key: int) -> Iterator[str]:
     settings = recording.settings
     sweeps = [registered.sweep for registered in recording.window(key).sweeps]
     if settings.register.deskew and any(sweep.offset_ns is None for sweep in sweeps):
-        yield "the points have no times of their own: motion within a sweep is not undone"
+        yield (
+            "the points have no times of their own: motion within a sweep is not undone, and unless"
+            " that was done before, confidence is low on purpose; densify doctor says what to do"
+        )
     untimed = {sweep.frame: sweep.num_untimed for sweep in sweeps if sweep.num_untimed}
     if untimed:
         yield (

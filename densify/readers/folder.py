@@ -8,7 +8,8 @@ points: in the lidar's frame, not deskewed. With ``compensated`` they are ego-mo
     discards the times.
 numbers: of file names; files named by times (``1317042651.468569638.pcd``) are numbered from 0.
 stamps: reference times, from names, a file such as ``timestamps.txt``, or the rate. Times of points
-    count from the stamp, or are absolute; their unit is that in which a sweep takes a period.
+    count from the stamp, or are absolute; their unit is that in which a sweep takes a period. With
+    ``time: azimuth`` they are computed from the azimuths of the points.
 poses: KITTI's 3x4, 4x4, TUM, tables with quaternions, or VIEWPOINT of PCD files. Poses with stamps
     are interpolated. Poses without stamps belong to the sweeps in order, or to the numbers from 0.
 images: need a calibration; stamped by names, a file, or the sweeps of the same numbers.
@@ -17,18 +18,19 @@ images: need a calibration; stamped by names, a file, or the sweeps of the same 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.types import Float
+from densify.geometry.turns import share_of_turn
+from densify.geometry.types import Float, Int
 from densify.readers import checks
 from densify.readers.file_sequence import FileSequence, Returns
-from densify.readers.folder_config import NAME, CameraFiles, FolderConfig
+from densify.readers.folder_config import AZIMUTH, NAME, CameraFiles, FolderConfig, SweepFiles
 from densify.readers.point_fields import Columns, PointLayout, PointTimes, sample_columns
 from densify.readers.point_files import SUFFIXES, read_table
 from densify.readers.recorded_poses import PoseFile, PoseTrack, transform_from_world
@@ -39,6 +41,7 @@ _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _SEARCH_DEPTH = 2  # levels of subfolders
 _ASSUMED_HZ = 10.0
 _NAMED = ("intensity", "time", "lidar")  # quantities whose column densify.yaml may name
+_SINCE_MIDDLE = {"start": -0.5, "middle": 0.0, "end": 0.5}  # turns from the middle to the reference
 _UNTIMED = (
     "times of points are left out: they are compensated, and no poses with stamps tell by how much"
 )
@@ -47,6 +50,32 @@ _UNTIMED = (
 def open_recording(path: Path, scene: str | None) -> Folder:
     """Return the recording in a folder of sweeps, which has no scenes."""
     return Folder(path)
+
+
+@dataclass(frozen=True)
+class Turn:
+    """How a scanner turns in each sweep, for firing times by azimuth."""
+
+    settings: SweepFiles  # direction, azimuth of the start, and reference of the stamp
+    duration_ns: int  # duration of a turn
+
+    def offset_ns(self, returns: Returns, points: Float) -> Int:
+        """Return the firing times (N,) since the stamp of points (N,3) of ``returns``, as fired."""
+        if returns.scanner_origins is not None:
+            lidar = 0 if returns.lidar is None else returns.lidar
+            points = points - returns.scanner_origins.take(lidar, axis=0, mode="clip")
+        is_clockwise = self.settings.turn == "clockwise"
+        middle_rad = np.deg2rad(self.settings.start_deg - 180.0)
+        share = share_of_turn(points, middle_rad, is_clockwise)
+        share -= _SINCE_MIDDLE[self.settings.reference or "middle"]
+        return np.rint(share * self.duration_ns).astype(np.int64)
+
+    def __str__(self) -> str:
+        return (
+            f"by azimuth, {self.settings.turn} turns of {self.duration_ns * 1e-6:.1f} ms from "
+            f"{self.settings.start_deg:g} deg, the stamp is the "
+            f"{self.settings.reference or 'middle'}"
+        )
 
 
 class Folder(FileSequence):
@@ -140,6 +169,8 @@ class Folder(FileSequence):
             ("stamped by", self._describe_stamps()),
             *self._stamped_by_sweeps.items(),
         ]
+        if drive := checks.drive_around(self.where):
+            lines.insert(0, ("part of", f"the KITTI drive {drive}, which has more: name that"))
         if self._poses is not None:
             lines.append(("poses from", f"{self._poses.path.name} ({self._poses.form})"))
         used = {str(Path(config.files)) for config in self._config.cameras.values()}
@@ -205,6 +236,8 @@ class Folder(FileSequence):
         frame, columns = next(iter(self._samples.items()))
         path, settings, stamps_ns = self._files[frame], self._settings, self._sweep_stamps_ns
         column_of = {quantity: getattr(settings, quantity) for quantity in _NAMED}
+        if self._turn is not None:
+            del column_of["time"]
         column_of = {quantity: name for quantity, name in column_of.items() if name}
         for quantity, name in column_of.items():
             if name not in columns:
@@ -212,7 +245,7 @@ class Folder(FileSequence):
                     f"{self._config.path}: sweeps.{quantity}: got {name!r}, expected a column of "
                     f"{path.name}: {', '.join(columns)}"
                 )
-        return PointLayout.find(
+        layout = PointLayout.find(
             [*self._samples.values()],
             path,
             self._period_ns,
@@ -223,6 +256,18 @@ class Folder(FileSequence):
             absolute=settings.time_is == "absolute" if settings.time_is else None,
             reference=settings.reference,
         )
+        if self._turn is None:
+            return layout
+        fields = {quantity: name for quantity, name in layout.fields.items() if quantity != "time"}
+        return replace(layout, fields=fields, times=None, time_words=str(self._turn))
+
+    @cached_property
+    def _turn(self) -> Turn | None:
+        """The turn that gives points their times, None if they have times of their own or none."""
+        if self._settings.time != AZIMUTH:
+            return None
+        rate_hz = self._settings.rate_hz
+        return Turn(self._settings, round(1e9 / rate_hz) if rate_hz else self._period_ns)
 
     @cached_property
     def _samples(self) -> dict[int, Columns]:
@@ -249,18 +294,25 @@ class Folder(FileSequence):
         points, origins = settings.scale_m * returns.points, settings.scanner_origins
         if settings.axes is not None:
             points = points @ settings.axes.T
-        returns = replace(returns, points=points, lidar=lidar, scanner_origins=origins)
-        if settings.frame == "poses":
-            if self._track is not None:
-                return self._track.undo_placement(returns, stamp_ns)
+        returns = replace(returns, lidar=lidar, scanner_origins=origins)
+        if settings.frame == "poses":  # compensated to the pose
             points = transform_from_world(points, self._pose(frame))
-            return replace(returns, points=points, offset_ns=None)  # compensated to the pose
-        if not settings.compensated or returns.offset_ns is None:
-            return returns
-        if self._track is None:  # the compensation cannot be undone, so the times do not apply
-            return replace(returns, offset_ns=None)
-        points = self._track.undo_compensation(points, stamp_ns, returns.offset_ns)
-        return replace(returns, points=points)
+        points, offset_ns = self._as_fired(replace(returns, points=points), stamp_ns)
+        return replace(returns, points=points, offset_ns=offset_ns)
+
+    def _as_fired(self, returns: Returns, stamp_ns: int) -> tuple[Float, Int | None]:
+        """Return the points (N,3) without compensation to ``stamp_ns``, and their times or None."""
+        points, offset_ns, track = returns.points, returns.offset_ns, self._track
+        times_of = None if self._turn is None else partial(self._turn.offset_ns, returns)
+        if not self._settings.compensated and self._settings.frame == "lidar":
+            return points, offset_ns if times_of is None else times_of(points)
+        if track is None:  # the compensation cannot be undone, so the times do not apply
+            return points, None
+        if times_of is not None:
+            return track.undo_compensation_by(times_of, points, stamp_ns)
+        if offset_ns is not None:
+            points = track.undo_compensation(points, stamp_ns, offset_ns)
+        return points, offset_ns
 
     def _pose(self, frame: int) -> Float:
         if self._track is not None:

@@ -19,6 +19,9 @@ from densify.readers import checks
 from densify.readers.point_fields import REFERENCES, UNIT_NS
 
 NAME = "densify.yaml"
+AZIMUTH = "azimuth"
+"""Value of ``sweeps.time`` for firing times by the azimuths of the points, without a column."""
+
 _NUM_COEFFICIENTS = {"pinhole": (0, 4, 5, 8, 12, 14), "fisheye": (4,), "mei": (5,)}
 _AXES = {s + a: (-1.0 if s else 1.0) * np.eye(3)[i] for s in ("", "-") for i, a in enumerate("xyz")}
 
@@ -47,6 +50,15 @@ def _array(value: Any, *shape: int) -> Float:
     """Return finite numbers as an array of this shape. Raise ValueError for other values."""
     array = np.array(value, dtype=np.float64).reshape(shape)
     return _require(np.isfinite(array).all(), array)
+
+
+def _rows(value: Any, length: int) -> Float:
+    """Return rows of ``length`` numbers as an array. Raise InputError if one has another length."""
+    rows = value if isinstance(value, list) else []
+    for number, row in enumerate(rows, 1):
+        if isinstance(row, list) and len(row) != length:
+            raise InputError(f"row {number} has {len(row)} numbers, not {length}")
+    return _array(value, -1, length)
 
 
 def _above_0(value: Any) -> float:
@@ -96,10 +108,10 @@ _NUMBER = Kind(lambda value: float(_array(value)), "a finite number")
 _ABOVE_0 = Kind(_above_0, "a finite number above 0")
 _UNIT = _one_of(UNIT_NS)
 _MOTION = Kind(
-    lambda value: checks.pose(_array(value, -1, 4), ""),
+    lambda value: checks.pose(_rows(value, 4), ""),
     "three or four rows of a rotation and translation",
 )
-_POINTS = Kind(lambda value: _array(value, -1, 3), "finite numbers of shape (N, 3)")
+_POINTS = Kind(lambda value: _rows(value, 3), "finite numbers of shape (N, 3)")
 
 
 @dataclass(frozen=True)
@@ -118,17 +130,24 @@ class SweepFiles:
     axes: Float | None = Kind(_axes, "x, y and z in some order, such as [z, -x, -y]").key(None)
     intensity: str = _TEXT.key("")  # name of the column with intensities
     intensity_scale: float = _ABOVE_0.key(0.0)  # stored intensity that becomes 1, 0 to detect
-    time: str = _TEXT.key("")  # name of the column with the firing times of the points
+    # Name of the column with the firing times of the points, or `AZIMUTH`
+    time: str = _TEXT.key("")
+    # Of times by azimuth: the direction of the turn seen from above, and the azimuth at which a
+    # sweep starts, anticlockwise from x
+    turn: str = _one_of(("clockwise", "anticlockwise")).key("clockwise")
+    start_deg: float = _NUMBER.key(180.0)
     time_unit: str = _UNIT.key("")  # unit of the firing times
     # "relative" for times since the stamp, "absolute" for times since an epoch
     time_is: str = _one_of(("relative", "absolute")).key("")
-    # Moment of the sweep that its stamp marks, "" to take the firing times as they are
+    # Moment of the sweep that its stamp marks; "" to take the firing times as they are, or for the
+    # middle of times by azimuth
     reference: str = _one_of(REFERENCES).key("")
     lidar: str = _TEXT.key("")  # name of the column with the index of the scanner
     # ``names`` if file names are stamps, or the path of a file with a stamp per sweep
     stamps: str = _TEXT.key("")
     stamps_unit: str = _UNIT.key("")  # unit of the stamps
-    rate_hz: float = _ABOVE_0.key(0.0)  # rate of sweeps without stamps; 0 for 10 Hz
+    # Rate of sweeps without stamps, 0 for 10 Hz; of times by azimuth, turns per second
+    rate_hz: float = _ABOVE_0.key(0.0)
     compensated: bool = _FLAG.key(False)  # points are ego-motion compensated to the stamp
     # Frame of the points: "lidar", or "poses" if each was placed with the pose of its moment
     frame: str = _one_of(("lidar", "poses")).key("lidar")
@@ -195,9 +214,13 @@ class FolderConfig:
         file = _File(path, lines)
         values = file.mapping("", values, ("sweeps", "poses", "cameras"))
         cameras = file.mapping("cameras", values.get("cameras"), None)
+        sweeps = file.filled(SweepFiles, "sweeps", values.get("sweeps"))
+        for key in ("turn", "start_deg"):
+            if sweeps.time != AZIMUTH and key in (values.get("sweeps") or {}):
+                raise file.error(f"sweeps.{key}", f"only times by azimuth use it: time: {AZIMUTH}")
         return FolderConfig(
             path,
-            file.filled(SweepFiles, "sweeps", values.get("sweeps")),
+            sweeps,
             file.filled(Poses, "poses", values.get("poses")),
             {name: file.camera(name, camera) for name, camera in cameras.items()},
         )
@@ -238,7 +261,10 @@ class _File(NamedTuple):
             try:
                 if value_got is not None:
                     arguments[name] = kind.convert(value_got)
-            except (ValueError, TypeError, KeyError, OverflowError, InputError):
+            except InputError as error:  # it says what is wrong
+                expected = f"{kind.expected}; {str(error).removeprefix(': ')}"
+                raise self.unfit(f"{key}.{name}", value_got, expected) from None
+            except (ValueError, TypeError, KeyError, OverflowError):
                 raise self.unfit(f"{key}.{name}", value_got, kind.expected) from None
             if value_got is None and key_field.default is MISSING:
                 raise self.unfit(f"{key}.{name}", None, kind.expected)

@@ -63,7 +63,6 @@ KITTI_TRIGGER_LATENCY_NS = 10_500_000
 """Lag of KITTI's recorded image stamps behind the exposure, which the scanner triggers as it faces
 forward. Drives 0002 and 0013 of 2011_09_26 record 10.50 ms (image_02) and 9.96 ms (image_03)."""
 
-_NUM_ROUNDS = 3  # rounds of the fixed-point iteration, in which the azimuth changes by few degrees
 _SMALLEST_IMAGE_PX = (1224, 370)  # of the tracking data set
 _T_CAM_UPRIGHT = np.array(  # from x right, y forward, z up
     [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
@@ -285,10 +284,9 @@ class KittiOdometry(Drive):
         stored, intensity = read_points(self._files[frame])
         if self._track is None:
             return Returns(stored, intensity)
-        points = stored
-        for _ in range(_NUM_ROUNDS):  # times from azimuths, then azimuths from times
-            offset_ns = turned_ns(points, self._stamps.period_ns)
-            points = self._track.undo_compensation(stored, self.stamp_ns(frame), offset_ns)
+        points, offset_ns = self._track.undo_compensation_by(
+            lambda points: turned_ns(points, self._stamps.period_ns), stored, self.stamp_ns(frame)
+        )
         return Returns(points, intensity, offset_ns)
 
     def _pose(self, frame: int) -> Float:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.config.file_content import described_in, parse_yaml, read_bytes, read_text
 from densify.geometry import poses
+from densify.geometry.turns import share_of_turn
 from densify.geometry.types import Bool, Camera, Float, Int
 from densify.readers import checks
 from densify.readers.stamped_files import date_ns
@@ -49,9 +50,7 @@ def turned_ns(points: Float, revolution_ns: int) -> Int:
     The scanner turns clockwise. The times are from minus half to plus half of ``revolution_ns``,
     the duration of a revolution. ``points`` (N,3) are in the lidar frame and not deskewed.
     """
-    # -0.5 to 0.5: firing times of the first half are negative
-    revolution = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
-    return np.rint(revolution * revolution_ns).astype(np.int64)
+    return np.rint(share_of_turn(points) * revolution_ns).astype(np.int64)
 
 
 @dataclass(frozen=True)

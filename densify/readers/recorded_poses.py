@@ -22,6 +22,7 @@ from densify.readers.timeline import format_frames
 _PCD_HEADER = 4096  # bytes that hold the header of a .pcd file
 _NO_VIEWPOINT = "0 0 0 1 0 0 0"
 _MAX_BEYOND_NS = 200_000_000  # longest extrapolation of a pose, at constant velocity
+_NUM_ROUNDS = 3  # rounds of the fixed-point iteration, in which the azimuth changes by few degrees
 _POSITIONS = tuple((a, f"t{a}", f"p{a}", f"pos_{a}", f"position_{a}") for a in "xyz")
 _TURNS = tuple((f"q{a}", f"q_{a}", f"rot_{a}", f"orientation_{a}") for a in "wxyz")
 _POSE_FILES = [
@@ -84,6 +85,19 @@ class PoseTrack:
         """Return (N,3) points moved from firing times to ``stamp_ns``, as data sets store them."""
         turns, shift_m = self._motion_since(stamp_ns, offset_ns)
         return turns.apply(points) + shift_m
+
+    def undo_compensation_by(
+        self, times_of: Callable[[Float], Int], points: Float, stamp_ns: int
+    ) -> tuple[Float, Int]:
+        """Return points (N,3) as measured, and their firing times (N,) since ``stamp_ns``.
+
+        ``times_of`` returns the firing times of points as measured, such as by their azimuths.
+        """
+        fired = points
+        for _ in range(_NUM_ROUNDS):  # times of points, then points as fired at these times
+            offset_ns = times_of(fired)
+            fired = self.undo_compensation(points, stamp_ns, offset_ns)
+        return fired, offset_ns
 
     def undo_placement(self, placed: Returns, stamp_ns: int) -> Returns:
         """Return world points as fired, or without times in the vehicle frame at ``stamp_ns``."""

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.geometry import poses
+from densify.geometry.turns import share_of_turn
 from densify.geometry.twists import move_with_twists
 from densify.geometry.types import Float, Int, RegisteredSweep, Stretch, Sweep, Trajectory
 
@@ -175,8 +176,7 @@ def turning_s(points: Float, period_s: float) -> Float:
 
     They hold for a clockwise turn of ``period_s`` whose middle, straight ahead, is at the stamp.
     """
-    turn: Float = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
-    return turn * period_s
+    return share_of_turn(points) * period_s
 
 
 def find_compensated(sweep: Sweep, twist: Float, period_s: float) -> Rings | None:
