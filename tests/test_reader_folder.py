@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from writers.excerpt import Excerpt
 
 from densify.config.errors import InputError
+from densify.geometry.clock import share_of_turn
 from densify.geometry.poses import inverse
-from densify.geometry.turns import share_of_turn
 from densify.outputs.simulated_street import config_text
 from densify.readers import describe, open_sequence
 from densify.readers.folder import Folder

@@ -125,7 +125,7 @@ depth; dataset.max_outliers, share of outliers with the key held out; dataset.mi
 the window; dataset.max_ratio, ghosts or outliers, as a multiple of those of neighbouring keys.
 dataset.split is kitti, train or val.
 
-== report (finished)
+== report (recordings)
 make a page for the browser, of a run, a comparison or a training set
 DIR  {_ONE_RUN}, of several keys, or of a training set
 {_OVERWRITE}
@@ -135,7 +135,7 @@ scores and costs. It is one HTML file that needs no network. It names files that
 damaged. The page of a training set has a verdict, the course of the scores, and pictures of the
 worst keys. The file is DIR/report.html, or DIR/compare.html for a comparison.
 
-== export (finished)
+== export (recordings)
 write a finished run in the formats of other tools
 RUN  {_ONE_RUN}, or of several keys (all forms but npy, exr, ply, pcd)
 --to FORMAT  {", ".join(EXPORTS)}: see docs/formats/writing.md (required)
@@ -149,7 +149,7 @@ Nothing is computed again, and the run does not change. A filled pixel has the a
 measured pixel.
 """
 _MORE = f"""
-== view (finished)
+== view (recordings)
 show a finished run in rerun or open3d
 DIR  {_ONE_RUN}, or of several keys of a drive
 --with {{rerun,open3d}} =rerun  the viewer: rerun, with sweeps over time, or open3d
@@ -179,7 +179,7 @@ DIR/NAME/STAMP.feather of the Argoverse 2 scene flow challenge. opensceneflow wr
 semantickitti writes DIR/sequences/NAME/predictions/FRAME.label, 251 moving and 9 static. doc-depth
 writes DIR/NAME, the poses and classes that DOC-Depth renders.
 
-== evaluate (finished)
+== evaluate (recordings)
 score depth maps against true depth, as KITTI's benchmark does
 PREDICTED  a PNG or a folder
 TRUTH  a PNG or a folder

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Find sweeps that are near each other in time."""
+"""Find sweeps that are near each other in time, and when a spinning scanner fired within one."""
 
 from __future__ import annotations
 
@@ -72,3 +72,17 @@ class Clock:
         """Return the seconds from sweep i to the first or the last sweep, whichever is nearer."""
         from_end_ns = min(self.time_ns[i] - self.time_ns[0], self.time_ns[-1] - self.time_ns[i])
         return float(from_end_ns) / 1e9
+
+
+def share_of_turn(points: Float, middle_rad: float = 0.0, clockwise: bool = True) -> Float:
+    """Return the (N,) shares of a turn, -0.5 to 0.5, from facing ``middle_rad`` to each firing.
+
+    Args:
+        points: (N,3) points relative to the scanner, as fired, with z along its spin axis.
+        middle_rad: Azimuth that the scanner faces in the middle of a sweep, anticlockwise from x.
+        clockwise: True if the scanner turns clockwise, seen from above.
+    """
+    azimuth_rad = np.arctan2(points[:, 1], points[:, 0])
+    share = (middle_rad - azimuth_rad) / (2 * np.pi)
+    share = share if clockwise else -share
+    return np.asarray(share - np.rint(share), np.float64)

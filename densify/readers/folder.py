@@ -26,7 +26,7 @@ import numpy as np
 
 from densify.config.errors import InputError
 from densify.geometry import poses
-from densify.geometry.turns import share_of_turn
+from densify.geometry.clock import share_of_turn
 from densify.geometry.types import Float, Int
 from densify.readers import checks
 from densify.readers.file_sequence import FileSequence, Returns

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from densify.config.errors import InputError
 from densify.config.file_content import described_in, parse_yaml, read_bytes, read_text
 from densify.geometry import poses
-from densify.geometry.turns import share_of_turn
+from densify.geometry.clock import share_of_turn
 from densify.geometry.types import Bool, Camera, Float, Int
 from densify.readers import checks
 from densify.readers.stamped_files import date_ns

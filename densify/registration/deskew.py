@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from densify.geometry import poses
-from densify.geometry.turns import share_of_turn
+from densify.geometry.clock import share_of_turn
 from densify.geometry.twists import move_with_twists
 from densify.geometry.types import Float, Int, RegisteredSweep, Stretch, Sweep, Trajectory
 
