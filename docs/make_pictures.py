@@ -275,7 +275,7 @@ def num_sweeps_of(folder: Path) -> int:
 
 
 def write_opening(folders: Sequence[Path]) -> None:
-    """Write the animation of the README: the window opens, as far as the recording goes.
+    """Write the animation of the README: the whole window, then how it opens.
 
     Both maps are measured, not filled, and each depth covers 3 x 3 pixels.
     """
@@ -290,7 +290,8 @@ def write_opening(folders: Sequence[Path]) -> None:
             sweeps = f"{num_sweeps} sweep{'s' * (num_sweeps > 1)}"
             shown.append(titled(picture[rows], f"{name}, {sweeps}, measured", 1000))
         frames.append(Image.fromarray(np.vstack(shown)))
-    path, times_ms = PICTURES / "pandaset.webp", [900] * (len(frames) - 1) + [2500]
+    frames = [frames[-1], *frames[:-1]]  # a still picture shows the whole window
+    path, times_ms = PICTURES / "pandaset.webp", [2500] + [900] * (len(frames) - 1)
     frames[0].save(
         path, save_all=True, append_images=frames[1:], duration=times_ms, loop=0, quality=70
     )
@@ -332,7 +333,7 @@ def make_set(runs: Path, pandaset: Path | None) -> None:
     if densify(["report", str(folder), "--overwrite"]):
         raise SystemExit("densify report failed; its message is above")
     command = [browser, "--headless", "--no-sandbox", "--hide-scrollbars"]
-    command += [f"--screenshot={screenshot}", "--window-size=1200,1840"]
+    command += [f"--screenshot={screenshot}", "--window-size=1200,1660"]
     subprocess.run([*command, (folder / "report.html").as_uri()], check=True)
     write("set", np.asarray(Image.open(screenshot).convert("RGB")))
 
