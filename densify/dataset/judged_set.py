@@ -2,9 +2,10 @@
 """Judge the keys of a training set by their scores: the worst keys, suspects, costs of limits.
 
 A key is as bad as its worst score. Scores compare by their distance from the median of the set, in
-widths of the range that is usual on KITTI. A key is suspect if its errors exceed what is usual, or
-if it lacks more of the coverage that its camera has elsewhere in the set than is usual. Coverage
-itself depends on scanner, camera and speed, and has no range that all sets should reach.
+widths of the range that is usual on KITTI. A key is suspect if its errors lie beyond the fence of
+the usual ones, or its coverage beyond the fence around the median of its camera in the set (Tukey,
+"Exploratory Data Analysis", 1977: quartiles and 1.5 of their distance, 2.7 standard deviations of a
+normal distribution). Coverage itself depends on scanner, camera and speed: no range fits all sets.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ import numpy as np
 from densify.dataset.manifest import USUAL_SHARES, Key, KeyRecord, read_manifests
 from densify.dataset.plan import Drive, drives_of, read_plan
 
+_FENCE, _END = 2.698, 1.645  # standard deviations, to a fence and to an end of 5 to 95 %
 _SHARES_LOST = (0.0, 0.05, 0.1)  # of the keys, by the limits whose cost is told; at least one key
-_NUMBER = re.compile(r"\d[\d.,:/-]*")
+_NUMBER = re.compile(r"\d+(?:[.,:/-]\d+)*")
 
 
 class Score(NamedTuple):
@@ -46,9 +48,12 @@ class Score(NamedTuple):
 SCORES = (
     Score("ghost", "Ghosts", 1, True, "max_ghost"),
     Score("outliers", "Held-out outliers", 1, True, "max_outliers"),
+    Score("outliers_moving", "Held-out outliers, moving", 1, True),
+    Score("outliers_filled", "Held-out outliers, filled", 1, True),
     Score("expected_outliers", "Expected outliers", 1, True),
     Score("density", "Measured depth", -1, False, "min_density", num_digits=1),
     Score("density_filled", "Filled depth", -1, False, num_digits=1),
+    Score("moving", "Moving points", 1, False),
     Score("seconds", "Computing time", 1, False, unit="s", num_digits=1),
 )
 
@@ -80,6 +85,7 @@ class Judgement(NamedTuple):
     series: Series
     value: float
     median: float
+    bound: float  # beyond which a key is suspect
     is_suspect: bool
 
     def reason(self, with_camera: bool) -> str:
@@ -88,7 +94,7 @@ class Judgement(NamedTuple):
         camera = f" of {self.series.camera}" if with_camera and self.series.camera else ""
         text = f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}"
         if score.is_error:
-            return f"{text}, usual up to {score.usual()[1]:g} {score.unit}"
+            return f"{text}, usual up to {score.text(self.bound)} {score.unit}"
         return f"{text}, median {score.text(self.median)} {score.unit}"
 
 
@@ -108,8 +114,9 @@ class JudgedSet(NamedTuple):
     records: Sequence[KeyRecord]  # ordered by recording and frame
     worst_first: Sequence[KeyRecord]  # the keys that are done
     worst: Mapping[Key, Judgement]  # the worst score of each key that is done
-    suspects: Mapping[Key, Sequence[Judgement]]  # suspect scores of the suspect keys alone
+    suspects: Mapping[Key, Sequence[Judgement]]  # suspect scores of the suspect keys that are done
     series: Sequence[Series]  # the scores that a key of the set has, by camera
+    bounds: Mapping[Series, float]  # value beyond which a key is suspect
 
     @property
     def cameras(self) -> list[str]:
@@ -129,11 +136,14 @@ class JudgedSet(NamedTuple):
         """Return a key's name, with the recording if there are several."""
         return f"{record.drive}, key {record.key}" if len(self.drives) > 1 else f"key {record.key}"
 
-    def worst_value(self, score: Score, record: KeyRecord) -> float | None:
-        """Return a score of the key's worst camera, None if unknown."""
-        values = [series.of(record) for series in self.series if series.score is score]
-        known = [value for value in values if value is not None]
-        return max(known, key=lambda value: score.is_bad * value, default=None)
+    def worst_value(self, score: Score, record: KeyRecord) -> tuple[float | None, str]:
+        """Return a score of the key's worst camera, None if unknown, and the camera of several."""
+        values = {s.camera: s.of(record) for s in self.series if s.score is score}
+        known = {camera: value for camera, value in values.items() if value is not None}
+        if not known:
+            return None, ""
+        camera = max(known, key=lambda name: score.is_bad * known[name])
+        return known[camera], camera if len(self.cameras) > 1 else ""
 
     def is_suspect_in(self, score: Score, record: KeyRecord) -> bool:
         """Return True if the score makes the key suspect, of any camera."""
@@ -153,6 +163,18 @@ class JudgedSet(NamedTuple):
         return chosen
 
 
+def suspects_of(records: Sequence[KeyRecord]) -> dict[Key, list[Judgement]]:
+    """Return the suspect scores, the worst first, of the suspect keys among those that are made.
+
+    Keys that were put aside count too: the others are judged as before.
+    """
+    suspects = {
+        name: [j for j in sorted(judgements, key=_badness, reverse=True) if j.is_suspect]
+        for name, judgements in _judge_all(records).items()
+    }
+    return {name: found for name, found in suspects.items() if found}
+
+
 def read_judged(root: Path) -> JudgedSet:
     """Read the plan and the manifests of a training set, and judge its keys."""
     table = read_plan(root) or {}
@@ -162,15 +184,10 @@ def read_judged(root: Path) -> JudgedSet:
     names = {series for record in records for series in _series_of(record)}
     order = {score.name: row for row, score in enumerate(SCORES)}
     series = sorted(names, key=lambda s: (order[s.score.name], s.camera))
-    judgements: dict[Key, list[Judgement]] = {record.name: [] for record in done}
-    for one in (s for s in series if s.score.usual()):
-        for name, judgement in _judge(one, done).items():
-            judgements[name].append(judgement)
-    worst = {name: max(all_, key=_badness) for name, all_ in judgements.items() if all_}
-    suspects = {
-        name: [j for j in sorted(all_, key=_badness, reverse=True) if j.is_suspect]
-        for name, all_ in judgements.items()
-    }
+    all_judgements = _judge_all(records)
+    worst = {name: max(judgements, key=_badness) for name, judgements in all_judgements.items()}
+    kept = {record.name for record in done}
+    bounds = {j.series: j.bound for judgements in all_judgements.values() for j in judgements}
 
     def badness(record: KeyRecord) -> tuple[bool, float]:
         return _badness(worst[record.name]) if record.name in worst else (False, -np.inf)
@@ -182,8 +199,9 @@ def read_judged(root: Path) -> JudgedSet:
         records,
         sorted(done, key=badness, reverse=True),
         worst,
-        {name: found for name, found in suspects.items() if found},
+        {name: found for name, found in suspects_of(records).items() if name in kept},
         series,
+        bounds,
     )
 
 
@@ -199,18 +217,27 @@ def _series_of(record: KeyRecord) -> Iterable[Series]:
         )
 
 
-def _judge(series: Series, done: Sequence[KeyRecord]) -> dict[Key, Judgement]:
-    """Return the judgement of one score for each key that has it."""
-    score = series.score
-    low, high = score.usual()
-    values = {r.name: value for r in done if (value := series.of(r)) is not None}
-    median = float(np.median([*values.values()])) if values else 0.0
-    judged = {}
-    for name, value in values.items():
-        distance = score.is_bad * (value - median) / (high - low)
-        is_suspect = value > high if score.is_error else distance > 1
-        judged[name] = Judgement(distance, series, value, median, is_suspect)
-    return judged
+def _judge_all(records: Sequence[KeyRecord]) -> dict[Key, list[Judgement]]:
+    """Return the judgements of all scores of each key that is made and has one."""
+    made = [record for record in records if record.status != "failed"]
+    judgements: dict[Key, list[Judgement]] = {}
+    for series in {series for record in made for series in _series_of(record)}:
+        if not (usual := series.score.usual()):
+            continue
+        low, high = usual
+        values = {r.name: value for r in made if (value := series.of(r)) is not None}
+        median = float(np.median([*values.values()]))
+        is_bad = series.score.is_bad
+        middle, scale = (low + high) / 2, 1.0
+        if not series.score.is_error:  # as shares of the camera's median
+            middle, scale = median, median / middle
+        bound = middle + is_bad * _FENCE * scale * (high - low) / (2 * _END)
+        for name, value in values.items():
+            distance = is_bad * (value - median) / (max(scale, 1e-9) * (high - low))
+            is_suspect = is_bad * (value - bound) > 0
+            judgement = Judgement(distance, series, value, median, bound, is_suspect)
+            judgements.setdefault(name, []).append(judgement)
+    return judgements
 
 
 def _badness(judgement: Judgement) -> tuple[bool, float]:
@@ -221,7 +248,7 @@ def limits_of(judged: JudgedSet) -> list[Limit]:
     """Return limits that put one key, about 5 and about 10 % of the keys aside."""
     limits = {}
     for score in (score for score in SCORES if score.limit):
-        known = (judged.worst_value(score, record) for record in judged.worst_first)
+        known = (judged.worst_value(score, record)[0] for record in judged.worst_first)
         values = sorted(score.is_bad * value for value in known if value is not None)
         for share in _SHARES_LOST:
             num_wanted = max(1, round(share * len(values)))
@@ -240,11 +267,13 @@ def limits_of(judged: JudgedSet) -> list[Limit]:
 def count_messages(records: Iterable[KeyRecord]) -> list[tuple[str, list[KeyRecord]]]:
     """Return (message, keys) for the reasons and warnings, the most frequent first.
 
-    Messages that differ in their numbers alone count as one, and the first of them is returned.
+    Messages that differ in their numbers alone count as one, without these numbers.
     """
     groups: dict[str, tuple[str, list[KeyRecord]]] = {}
     for record in records:
         status = "" if record.status == "done" else f"{record.status}: {record.reason}"
         for text in filter(None, [status, *record.warnings]):
-            groups.setdefault(_NUMBER.sub("#", text), (text, []))[1].append(record)
+            same = _NUMBER.sub("…", text)
+            first, keys = groups.get(same, (text, []))
+            groups[same] = (first if text == first else same, [*keys, record])
     return sorted(groups.values(), key=lambda group: -len(group[1]))

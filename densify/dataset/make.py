@@ -24,6 +24,7 @@ from densify.config import as_mapping
 from densify.config.cache import Cache
 from densify.config.errors import ComputationError, InputError, OutputError, is_out_of_memory
 from densify.dataset.executor import call_all, logged_to
+from densify.dataset.judged_set import suspects_of
 from densify.dataset.manifest import (
     USUAL_SHARES,
     Key,
@@ -56,6 +57,7 @@ from densify.pipeline import run as pipeline
 from densify.pipeline.key_result import looks_around, methods_of_run
 from densify.pipeline.recording import Recording
 from densify.readers import open_sequence
+from densify.scores.metrics import shown_score
 from densify.version import __version__
 
 _log = logging.getLogger("densify")
@@ -232,6 +234,8 @@ def _finished(
     records = {name: before[name] for name in names}
     if gate is None:
         return records
+    if gate.max_outliers is not None:  # keys that were not scored cannot be judged
+        records = {name: r for name, r in records.items() if r.scores.get("outliers")}
     beyond = beyond_limits(records, gate)
     return {name: r for name, r in records.items() if r.status == "done" or name in beyond}
 
@@ -311,7 +315,13 @@ def beyond_limits(records: Mapping[Key, KeyRecord], gate: Gate) -> dict[Key, str
     worse = {} if ratio is None else worse_than_neighbours(records, ratio)
     made = ((name, record) for name, record in records.items() if record.status != "failed")
     own = {name: gate.reason(record.scores, len(record.frames)) for name, record in made}
-    return worse | {name: reason for name, reason in own.items() if reason is not None}
+    beyond = worse | {name: reason for name, reason in own.items() if reason is not None}
+    if gate.suspects == "aside":
+        suspects = suspects_of([*records.values()])
+        beyond = {
+            name: found[0].reason(with_camera=True) for name, found in suspects.items()
+        } | beyond
+    return beyond
 
 
 def worse_than_neighbours(records: Mapping[Key, KeyRecord], max_ratio: float) -> dict[Key, str]:
@@ -433,14 +443,21 @@ def _scores(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Return the scores for a manifest line from the metrics of a result."""
     held_out = metrics["held_out"] or {}
     errors = {name: scores["measured"]["all"] for name, scores in held_out.items()}
+    num_points, num_moving = metrics["num_points"], metrics["num_moving"]
     expected = metrics.get("expected_outliers", {})
     return {
-        "num_points": metrics["num_points"],
-        "num_moving": metrics["num_moving"],
+        "num_points": num_points,
+        "num_moving": num_moving,
+        "moving": num_moving / num_points if num_points else None,
         "ghost": metrics["ghosts"]["all"],
         "density": {name: shares["measured"] for name, shares in metrics["density"].items()},
         "density_filled": {name: shares["filled"] for name, shares in metrics["density"].items()},
         "outliers": {name: scores["outliers"] for name, scores in errors.items()},
+        "outliers_moving": {
+            name: shown_score(scores["measured"]["moving"], "outliers")
+            for name, scores in held_out.items()
+        },
+        "outliers_filled": {n: s["filled"]["all"]["outliers"] for n, s in held_out.items()},
         "expected_outliers": {name: shares["measured"] for name, shares in expected.items()},
         "mae_m": {name: scores["mae_m"] for name, scores in errors.items()},
     }

@@ -160,6 +160,15 @@ def describe_pace(records: Iterable[KeyRecord]) -> str:
     return f"{np.median(seconds):.1f} s a key{span}"
 
 
+def describe_cost(records: Iterable[KeyRecord]) -> str:
+    """Return the computing time and the disk space of all tried keys together as text."""
+    records = list(records)
+    seconds = sum(record.seconds for record in records)
+    num_bytes = sum(file.num_bytes for record in records for file in record.files.values())
+    disk = f", {_size(num_bytes)}" if num_bytes else ""
+    return f"{_duration(seconds, seconds)} in all{disk}" if records else ""
+
+
 def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:
     """Return the expected time and disk space of the ``num_left`` keys as text, "" for no keys."""
     records = list(records)

@@ -53,6 +53,7 @@ class Gate(Section):
         min_sweeps: Least number of sweeps in the window, which ends and holes in time may cut.
         max_ratio: Greatest share of ghosts or held-out outliers, as a multiple of the median of the
             neighbouring key sweeps.
+        suspects: ``keep`` or put ``aside`` the key sweeps that the page of the set calls suspect.
         split: Split of the tree, ``train`` or ``val``; ``kitti`` takes KITTI's official split.
     """
 
@@ -61,6 +62,7 @@ class Gate(Section):
     max_outliers: float | None = number_field(None, 0, 1)
     min_sweeps: int | None = number_field(None, 1, 101)
     max_ratio: float | None = number_field(4.0, 1, 1e6)
+    suspects: str = choice_field("keep", "aside")
     split: str = choice_field("kitti", "train", "val")
 
     def reason(self, scores: Mapping[str, Any], num_sweeps: int) -> str | None:
@@ -285,6 +287,7 @@ def _check_same(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) ->
     """Raise InputError if a set was made with another recipe or another version of densify."""
     expected, got = (_flat({name: table[name] for name in _RECIPE}) for table in (before, now))
     limits = {f"gate.{name}" for name in asdict(Gate()) if name != "split"}
+    limits |= {"config.output.score"}  # a limit of outliers turns it on; maps do not depend on it
     for option in {**expected, **got}:
         if option not in limits and got.get(option) != expected.get(option):
             raise InputError(

@@ -32,14 +32,19 @@ from densify.dataset.judged_set import (
     limits_of,
     read_judged,
 )
-from densify.dataset.manifest import Key, KeyRecord, describe_pace, describe_rest
+from densify.dataset.manifest import (
+    Key,
+    KeyRecord,
+    describe_cost,
+    describe_pace,
+    describe_rest,
+)
 from densify.dataset.plan import Drive, planned_keys
 from densify.depth.exposure import key_shots
 from densify.geometry.types import METHOD_NAMES, Float32, LidarSequence
 from densify.outputs.depth_png import Picture, encode_jpeg, metres, read_stored
 from densify.outputs.folders import write_file
 from densify.outputs.plots import (
-    FEWEST_IN_HISTOGRAM,
     Axis,
     Dot,
     depth_over_image,
@@ -53,9 +58,10 @@ FILLED = ("depth_filled", "groundtruth_filled")
 """Folders of the maps of filled depth, in the two layouts."""
 _MEASURED = ("depth", "groundtruth")
 _ASIDE = "aside"  # folder of the pictures of keys that are put aside, in a training set
-_WIDTH_PX = 620
+_WIDTH_PX, _WIDTH_OF_WORST_PX, _WIDTH_OF_SMALL_PX = 620, 960, 150
 _QUALITY = 75
-_NUM_WORST, _NUM_SPREAD = 6, 12  # keys with pictures: the worst, and others spread over the set
+# Keys with pictures: the worst, others spread over the set, and small ones
+_NUM_WORST, _NUM_SPREAD, _NUM_SMALL = 6, 6, 60
 _NUM_DRIVES = 12  # recordings in the first table, the others are folded
 _NUM_ASIDE = 12  # keys with pictures among those put aside
 _NUM_LISTED = 1000  # rows of the table of keys, the worst first
@@ -86,6 +92,7 @@ def _set_page(root: Path, command: str) -> bytes:
     """Return the bytes of the page of a training set; ``command`` continues a preview."""
     made = read_judged(root)
     left_out = [record for record in made.records if record.status != "done"]
+    left_out.sort(key=lambda record: record.status, reverse=True)  # failed ones first
     worst = made.worst_moments(_NUM_WORST)
     spread = _spread(made, worst)
     aside = _worst_aside(made, left_out)
@@ -96,7 +103,7 @@ def _set_page(root: Path, command: str) -> bytes:
     if len(listed) < len(made.worst_first):
         title = f"The {len(listed):,} worst keys"
     level, verdict = _verdict(made, {**rows, **cards})
-    score_heads = ("score", "median", _range_head(made), "usual on KITTI", "suspect keys")
+    score_heads = ("score", "median", _range_head(made), "suspect beyond", "suspect keys")
     message_heads = ("reason or warning", "keys", "for example")
     parts = {
         "title": f"Training set {html.escape(root.resolve().name)}",
@@ -108,9 +115,10 @@ def _set_page(root: Path, command: str) -> bytes:
         "messages": _table(message_heads, _message_rows(made, {**rows, **cards})),
         "limits": _table(("with", "keys put aside"), _limit_rows(made)),
         "suspects": html.escape("\n".join(f"{drive} {key}" for drive, key in made.suspects)),
+        "small": "\n".join(_small_card(made, record, cards, rows) for record in _small(made)),
         "plots": "\n".join(_plot(made, score, rows) for score in SCORES),
         "legend": _legend(made),
-        "worst": "\n".join(_card(made, record) for record in worst),
+        "worst": "\n".join(_card(made, record, _WIDTH_OF_WORST_PX) for record in worst),
         "spread": "\n".join(_card(made, record) for record in spread),
         "aside": "\n".join(_card(made, record) for record in aside),
         "left_out": _key_table(made, left_out, cards),
@@ -128,6 +136,15 @@ def _spread(made: JudgedSet, worst: Sequence[KeyRecord]) -> list[KeyRecord]:
     others = [r for r in made.records if r.status == "done" and r not in worst]
     rows = np.linspace(0, len(others) - 1, min(_NUM_SPREAD, len(others))).astype(int)
     return [others[row] for row in rows]
+
+
+def _small(made: JudgedSet) -> list[KeyRecord]:
+    """Return keys for small pictures: all if they are few, else evenly spread and some suspect."""
+    done = [record for record in made.records if record.status == "done"]
+    rows = np.linspace(0, len(done) - 1, min(_NUM_SMALL, len(done))).astype(int)
+    suspect = [record for record in made.worst_first if record.name in made.suspects]
+    shown = {done[row].name for row in rows} | {r.name for r in suspect[: _NUM_SMALL // 3]}
+    return [record for record in done if record.name in shown]
 
 
 def _worst_aside(made: JudgedSet, left_out: Sequence[KeyRecord]) -> list[KeyRecord]:
@@ -149,7 +166,8 @@ def _state(made: JudgedSet, command: str) -> str:
     recordings = names[0] if len(names) == 1 else f"{len(names):,} recordings"
     source = f"{recordings}, densify {made.table['densify']}"
     pace = describe_pace(made.records)
-    state = html.escape("; ".join(filter(None, [source, ", ".join(parts), pace])))
+    cost = describe_cost(made.records)
+    state = html.escape("; ".join(filter(None, [source, ", ".join(parts), pace, cost])))
     if not num_left:
         return state
     kind = "Preview" if command else "Not finished"
@@ -161,37 +179,58 @@ def _state(made: JudgedSet, command: str) -> str:
         "The finished set is checked once more: a key that is far worse than the keys around it "
         "is put aside."
     )
+    if command and not made.table["config"]["output"]["score"]:
+        later += (
+            " The other keys get no held-out scores, unless <code>--set output.score=true</code> "
+            "is added, which takes twice the time."
+        )
     return f"<b>{kind}: {num_tried}</b>; {rest}: {how}<br>{state}. {later}"
 
 
 def _verdict(made: JudgedSet, targets: Mapping[Key, str]) -> tuple[str, str]:
-    """Return ``good``, ``look`` or ``bad``, and sentences as HTML that say why."""
+    """Return ``good``, ``look`` or ``bad``, and sentences as HTML that say why and what to do."""
     if not made.worst_first:
-        return "bad", "✗ No key is done."
-    num_done, errors = len(made.worst_first), [s for s in made.series if s.score.is_error]
-    errors = [series for series in errors if series.score.usual() and made.values(series)]
-    worse = [s for s in errors if np.median(made.values(s)) > s.score.usual()[1]]
-    level, lines = "good", [f"✓ Good: no key of {num_done:,} stands out."]
-    if made.suspects:
-        level = "look"
-        ordered = [r.name for r in made.worst_first if r.name in made.suspects]
-        named = ordered[:_NUM_NAMED]
-        links = [_suspect_link(made, name, targets) for name in named]
-        num_more = len(made.suspects) - len(named)
-        links += [f"and {num_more:,} more"] if num_more else []
-        verb = "is" if len(made.suspects) == 1 else "are"
-        count = f"{len(made.suspects):,} of {num_done:,} keys {verb} suspect"
-        lines = [f"! {count}: {', '.join(links)}."]
+        return "bad", "✗ Stop: no key is done. The reasons are below."
+    num_done, num_all = len(made.worst_first), len(made.records)
+    worse = [
+        series
+        for series, bound in made.bounds.items()
+        if series.score.is_error and made.values(series)
+        if np.median(made.values(series)) > bound
+    ]
+    lines = []
     if worse:
-        level = "bad"
-        names = ", ".join(_title(made, series).lower() for series in worse)
-        lines.insert(0, f"✗ The median key is worse than usual on {_USUAL}: {html.escape(names)}.")
+        level, names = "bad", ", ".join(_title(made, series).lower() for series in worse)
+        lines.append(
+            f"✗ Stop: the median key is worse than usual on {_USUAL}: {html.escape(names)}. "
+            "<code>densify doctor</code> looks for the reason."
+        )
+    elif made.suspects:
+        level = "look"
+        lines.append("! Usable, but look at the suspect keys before you train on them.")
+    else:
+        level = "good"
+        lines.append(f"✓ Good: no key of {num_done:,} is suspect.")
+    if made.suspects:
+        lines.append(_suspect_sentence(made, targets))
     lines.append(_error_sentence(made))
-    num_out = len(made.records) - num_done
-    if num_out > _MANY_ASIDE * len(made.records):
+    if num_all - num_done > _MANY_ASIDE * num_all:
         level = "look" if level == "good" else level
-        lines.append(f"{num_out:,} of {len(made.records):,} keys were put aside or failed.")
+        lines.append(f"{num_all - num_done:,} of {num_all:,} keys were put aside or failed.")
     return level, " ".join(lines)
+
+
+def _suspect_sentence(made: JudgedSet, targets: Mapping[Key, str]) -> str:
+    """Return how many keys are suspect by which scores, with links to the worst, as HTML."""
+    ordered = [record.name for record in made.worst_first if record.name in made.suspects]
+    links = [_suspect_link(made, name, targets) for name in ordered[:_NUM_NAMED]]
+    num_more = len(ordered) - len(links)
+    links += [f"and {num_more:,} more"] if num_more else []
+    causes = Counter(_title(made, made.suspects[name][0].series).lower() for name in ordered)
+    by = ", ".join(f"{html.escape(title)} {num:,}" for title, num in causes.most_common())
+    verb = "is" if len(ordered) == 1 else "are"
+    count = f"{len(ordered):,} of {len(made.worst_first):,} keys {verb} suspect"
+    return f"{count} (by {by}): {', '.join(links)}."
 
 
 def _suspect_link(made: JudgedSet, name: Key, targets: Mapping[Key, str]) -> str:
@@ -235,24 +274,18 @@ def _range_head(made: JudgedSet) -> str:
 
 
 def _score_row(made: JudgedSet, series: Series) -> list[str]:
-    """Return the cells of a score: its median and range in the set, usual values, suspects."""
+    """Return the cells of a score: its median and range in the set, bound, suspects."""
     score, values = series.score, made.values(series)
     ends = (0.05, 0.95) if len(values) >= _FEWEST_IN_RANGE else (0.0, 1.0)
     cells = ["", ""]
     if values:
         low, middle, high = map(float, np.quantile(values, (ends[0], 0.5, ends[1])))
         cells = [f"{score.text(middle)} {score.unit}", f"{score.text(low)} to {score.text(high)}"]
-    usual = score.usual()
-    text = (
-        ""
-        if not usual
-        else f"to {usual[1]:g}"
-        if score.is_error
-        else f"{usual[0]:g} to {usual[1]:g}"
-    )
+    bound = made.bounds.get(series)
+    text = "" if bound is None else f"{'>' if score.is_bad > 0 else '<'} {score.text(bound)}"
     suspect = sum(any(j.series == series for j in found) for found in made.suspects.values())
     return [html.escape(cell) for cell in (_title(made, series), *cells, text)] + [
-        _marked(f"{suspect:,}", bool(suspect)) if usual else ""
+        "" if bound is None else _marked(f"{suspect:,}", bool(suspect))
     ]
 
 
@@ -279,7 +312,7 @@ def _drive_tables(made: JudgedSet, rows: Mapping[Key, str]) -> dict[str, str]:
             _marked(f"{num_suspect:,}", bool(num_suspect)),
         ]
         for score in scores:
-            known = [v for r in done if (v := made.worst_value(score, r)) is not None]
+            known = [v for r in done if (v := made.worst_value(score, r)[0]) is not None]
             cells.append(score.text(float(np.median(known))) if known else "")
         bad_share = (num_suspect + counts["aside"] + counts["failed"]) / max(len(records), 1)
         lines.append((bad_share, cells))
@@ -328,57 +361,77 @@ def _drive_rows(made: JudgedSet) -> Iterator[list[str]]:
         yield [html.escape(text) for text in (drive.name, split, ", ".join(cameras))]
 
 
+def _style(made: JudgedSet, series: Series) -> str:
+    """Return the name of the colour of a camera in the style sheet."""
+    names = made.cameras
+    return f"camera-{names.index(series.camera) % 6}" if series.camera in names else "camera-0"
+
+
 def _plot(made: JudgedSet, score: Score, rows: Mapping[Key, str]) -> str:
     """Return the values of a score over the frames as SVG, "" if no key has the score."""
-    series_of_score = [series for series in made.series if series.score is score]
-    worst, half = made.worst_first, _NUM_DOTS // (2 * max(len(series_of_score), 1))
-    shown = {record.name for record in (*worst[:half], *worst[half :: len(worst) // half + 1])}
-    dots, values = [], []
+    of_score = {series: _style(made, series) for series in made.series if series.score is score}
+    all_values = {style: made.values(series) for series, style in of_score.items()}
+    bounds = {style: made.bounds[s] for s, style in of_score.items() if s in made.bounds}
+    shown = [*all_values.values(), *([bound] for bound in bounds.values())]
+    known = [value for values in shown for value in values]
+    if not any(all_values.values()):
+        return ""
+    lowest, highest = min(known), max(known)
+    if score.is_bad > 0:
+        lowest = 0.0
+    if score.name == "seconds":  # rare waits would flatten the others
+        highest = min(highest, 3 * float(np.median(known)))
+    axis = Axis(f"{score.title}, {score.unit}", lowest, highest, all_values, bounds)
+
+    dots, drawn = [], _drawn(made)
     for record in made.records:
-        if record.status == "done" and record.name not in shown:
-            continue
         target, name = rows.get(record.name, ""), f"{record.drive}, key {record.key}"
         if record.status == "failed":
             dots.append(Dot(record.drive, record.key, None, "", f"{name}: failed", target))
-        for number, series in enumerate(series_of_score):
-            if (value := series.of(record)) is not None and record.status != "failed":
-                values.append(value)
-                is_suspect = any(j.series == series for j in made.suspects.get(record.name, ()))
-                hollow = "hollow" if record.status == "aside" else ""
-                style = f"camera-{number % 6} {hollow} {'suspect' if is_suspect else ''}"
+        elif record.status == "aside" or record.name in drawn:
+            for series, style in of_score.items():
+                if (value := series.of(record)) is None:
+                    continue
+                suspect = made.suspects.get(record.name, ())
+                marks = {
+                    "hollow": record.status == "aside",
+                    "suspect": any(judgement.series == series for judgement in suspect),
+                    "above": value > axis.ticks()[-1],
+                }
+                style = " ".join([style, *(mark for mark, is_on in marks.items() if is_on)])
                 text = f"{name} {series.camera}: {score.text(value)} {score.unit}"
                 dots.append(Dot(record.drive, record.key, value, style, text, target))
-    if not values:
-        return ""
-    usual = score.usual()
-    if score.name == "seconds":  # rare waits would flatten the others
-        values = [min(value, 3 * float(np.median(values))) for value in values]
-    lowest, highest = min(values + usual[:1]), max(values + usual[1:])
-    if score.is_bad > 0:  # a lower value is no worse
-        lowest, usual = 0.0, [0.0, *usual[1:]] if usual else []
-    share = made.table["gate"].get(score.limit)
-    limit = None if share is None else 100 * share
-    return score_plot(Axis(f"{score.title}, {score.unit}", lowest, highest, usual, limit), dots)
+    return score_plot(axis, dots)
+
+
+def _drawn(made: JudgedSet) -> set[Key]:
+    """Return the keys that have a dot: of many the worst, and others."""
+    worst, half = made.worst_first, _NUM_DOTS // 2
+    return {record.name for record in (*worst[:half], *worst[half :: len(worst) // half + 1])}
 
 
 def _legend(made: JudgedSet) -> str:
     """Return what the marks of the plots mean as HTML, for the marks that they have."""
-    names = made.cameras
     dots = [
-        f'<svg class="mark" viewBox="0 0 8 8"><circle cx="4" cy="4" r="3" class="camera-{n % 6}"/>'
-        f"</svg>&nbsp;{html.escape(name)}"
-        for n, name in enumerate(names)
-        if len(names) > 1
+        '<span class="nowrap"><svg class="mark" viewBox="0 0 8 8"><circle cx="4" cy="4" r="3" '
+        f'class="camera-{n % 6}"/></svg>&nbsp;{html.escape(name)}</span>'
+        for n, name in enumerate(made.cameras)
+        if len(made.cameras) > 1
     ]
-    statuses, gate = {record.status for record in made.records}, made.table["gate"]
+    seconds = [record.seconds for record in made.worst_first] or [0.0]
+    statuses, num_done = {record.status for record in made.records}, len(made.worst_first)
+    num_drawn = len(_drawn(made))
     marks = {
         f"Cameras: {', '.join(dots)}.": bool(dots),
-        "Ringed in red: suspect.": bool(made.suspects),
+        f"Drawn are {num_drawn:,} of {num_done:,} keys, the worst and others; the histograms have "
+        "all.": num_drawn < num_done,
+        "Dashed: beyond it, a key is suspect.": bool(made.bounds),
+        "Red: suspect.": bool(made.suspects),
         "Hollow: put aside.": "aside" in statuses,
         "Cross: failed.": "failed" in statuses,
-        "Band: usual on KITTI.": True,
-        "Dashed: limit of the set.": any(gate[s.limit] is not None for s in SCORES if s.limit),
-        "At the left: histogram.": len(made.records) >= FEWEST_IN_HISTOGRAM,
+        "Triangle: beyond the plot, such as the first key, which waits for compilation.": (
+            max(seconds) > 3 * float(np.median(seconds))
+        ),
     }
     return " ".join(text for text, is_used in marks.items() if is_used)
 
@@ -387,11 +440,31 @@ def _anchor(kind: str, record: KeyRecord) -> str:
     return f"{kind}-{quote(record.drive)}-{record.key}"
 
 
-def _card(made: JudgedSet, record: KeyRecord) -> str:
+def _small_card(
+    made: JudgedSet, record: KeyRecord, cards: Mapping[Key, str], rows: Mapping[Key, str]
+) -> str:
+    """Return a small picture of a key's filled depth that leads to its card or row, as HTML."""
+    camera = _worst_camera(made, record)
+    try:
+        depth = find_map(record, FILLED, camera)
+        if depth is None:
+            return ""
+        stored = _shrink(read_stored(made.root / depth, np.uint16, "a map"), _WIDTH_OF_SMALL_PX)
+        picture = _image(_draw_depth(metres(stored), None), f"key {record.key}")
+    except (InputError, OSError):
+        return ""
+    name = html.escape(made.name_of(record))
+    target = cards.get(record.name) or rows.get(record.name, "")
+    style = ' class="suspect"' if record.name in made.suspects else ""
+    link = f' href="#{target}"' if target else ""
+    return f'<a{link}{style} title="{name}">{picture}{record.key}</a>'
+
+
+def _card(made: JudgedSet, record: KeyRecord, width_px: int = _WIDTH_PX) -> str:
     """Return the pictures of a key with its scores, and a link to its own page or its command."""
     name, camera, pictures = made.name_of(record), _worst_camera(made, record), ""
     try:
-        for picture in _pictures(made, record, camera, name):
+        for picture in _pictures(made, record, camera, name, width_px):
             pictures += picture
     except (InputError, OSError) as error:
         pictures += f"<p>{html.escape(str(error))}</p>"
@@ -414,7 +487,7 @@ def _card(made: JudgedSet, record: KeyRecord) -> str:
         )
         if (path := find_map(record, kinds, camera))
     )
-    files = f"{'<br>' if remarks else ''}Files: {files}" if files else ""
+    files = f"{'<br>' if remarks else ''}Files (PNG of 16 bits): {files}" if files else ""
     return (
         f'<figure id="{_anchor("card", record)}"><figcaption>'
         f"{_link(name, _own_page(record))}, {html.escape(camera)}<br>{', '.join(texts)}"
@@ -434,20 +507,25 @@ def _page_command(made: JudgedSet, record: KeyRecord) -> str:
     """Return the command that makes the page of a key as HTML, "" if the key has one."""
     if _own_page(record).endswith("report.html"):
         return ""
-    data, window = made.drives[record.drive].data, made.table["window"]
-    words = ["densify", "run", data, "--key", str(record.key), "--window", str(window), "--report"]
+    drive, table = made.drives[record.drive], made.table
+    words = ["densify", "run", drive.data, "--key", str(record.key), "--report"]
+    words += ["--window", str(table["window"]), "--method", table["method"]]
+    words += [word for camera in table["cameras"] or () for word in ("--camera", camera)]
     command = html.escape(shlex.join(words))
     return f"<details><summary>Command for its own page</summary><code>{command}</code></details>"
 
 
-def _pictures(made: JudgedSet, record: KeyRecord, camera: str, name: str) -> Iterator[str]:
+def _pictures(
+    made: JudgedSet, record: KeyRecord, camera: str, name: str, width_px: int
+) -> Iterator[str]:
     """Yield the image, the two depth maps and the confidence of a key as HTML, if it has them."""
     drive, image = made.drives[record.drive], None
     kept = next((n for n in record.files if n.startswith(f"{_ASIDE}/")), None)
     for title, kinds in (("measured depth", _MEASURED), ("filled depth", FILLED)):
         if (depth := find_map(record, kinds, camera)) is None:
             continue
-        small_m = metres(_shrink(read_stored(made.root / depth, np.uint16, "a depth map")))
+        stored = read_stored(made.root / depth, np.uint16, "a depth map")
+        small_m = metres(_shrink(stored, width_px))
         if image is None:
             image = _small_image(drive, camera, record.key, small_m.shape[::-1])
             if image is not None:
@@ -456,9 +534,9 @@ def _pictures(made: JudgedSet, record: KeyRecord, camera: str, name: str) -> Ite
     if kept is not None:
         yield _embedded((made.root / kept).read_bytes(), f"filled depth, {name}")
     if (confidence := find_map(record, ("confidence",), camera)) is not None:
-        stored = _shrink(read_stored(made.root / confidence, np.uint8, "a map of confidence"))
-        values = (stored - 1.0) / 254
-        gray = np.interp(values, _CONFIDENCE, _GRAY)[:, :, None]
+        stored = read_stored(made.root / confidence, np.uint8, "a map of confidence")
+        stored = _shrink(stored, width_px)
+        gray = np.interp((stored - 1.0) / 254, _CONFIDENCE, _GRAY)[:, :, None]
         picture = np.where(stored[:, :, None] > 0, gray, _NO_DEPTH_RGB).astype(np.uint8)
         yield _image(np.ascontiguousarray(picture), f"confidence, {name}")
 
@@ -490,13 +568,14 @@ def _key_table(made: JudgedSet, records: Sequence[KeyRecord], cards: Mapping[Key
         target = cards.get(record.name)
         cells = [_link(made.name_of(record), f"#{target}" if target else _own_page(record))]
         for score in made.scores:
-            text = score.text(made.worst_value(score, record))
-            cells.append(_marked(text, made.is_suspect_in(score, record)))
+            value, camera = made.worst_value(score, record)
+            text = _marked(score.text(value), made.is_suspect_in(score, record))
+            cells.append(f"{text}<br><small>{html.escape(camera)}</small>" if camera else text)
         rows.append(cells)
         attributes.append(f' id="{_anchor("row", record)}"')
         status = "" if record.status == "done" else f"{record.status}: {record.reason}"
         if remarks := "; ".join(filter(None, [status, *record.warnings])):
-            rows.append([html.escape(remarks)])
+            rows.append([f"<div>{html.escape(remarks)}</div>"])
             attributes.append(' class="remark"')
     heads = ["key", *(f"{score.title}, {score.unit}" for score in made.scores)]
     return _table(heads, rows, attributes)
@@ -535,9 +614,9 @@ def find_map(record: KeyRecord, kinds: tuple[str, ...], camera: str) -> str | No
     return next(map(str, of_camera), None)
 
 
-def _shrink(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a map with every n-th row and column, about as wide as a picture."""
-    step = max(1, values.shape[1] // _WIDTH_PX)
+def _shrink(values: NDArray[Any], width_px: int = _WIDTH_PX) -> NDArray[Any]:
+    """Return a map with every n-th row and column, at least as wide as a picture if it can be."""
+    step = max(1, values.shape[1] // width_px)
     return np.ascontiguousarray(values[::step, ::step])
 
 

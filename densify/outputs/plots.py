@@ -42,8 +42,7 @@ _AXES_INCH = (8.6, 4.8)
 _PLOT_PX, _PLOT_TOP_PX, _PLOT_BASE_PX = (400, 160), 26, 138
 _LABELS_PX, _HISTOGRAM_PX, _GAP_PX = 30, 60, 8
 _NUM_BINS, _LEAST_LABEL_PX, _NUM_TICKS = 20, 90, 3
-FEWEST_IN_HISTOGRAM = 10
-"""Number of keys from which a plot has a histogram."""
+_MANY_DOTS = 300  # more of them are small
 _FEWEST_OUTLIERS = 1e-4  # the axis is linear below this share and logarithmic above
 _MIN_TRAVEL_M = 1.0
 """A shorter way may be noise of the registration, of a vehicle at rest."""
@@ -248,8 +247,8 @@ class Axis(NamedTuple):
     title: str
     lowest: float
     highest: float
-    usual: Sequence[float] = ()  # lowest and highest usual value, drawn as a band
-    limit: float | None = None  # drawn as a dashed line
+    values: Mapping[str, Sequence[float]]  # style of the bars -> values of the histogram
+    bounds: Mapping[str, float]  # style of a dashed line -> its value
 
     def ticks(self) -> list[float]:
         """Return round values that enclose the shown ones."""
@@ -261,11 +260,11 @@ class Axis(NamedTuple):
 
 
 def score_plot(axis: Axis, dots: Sequence[Dot]) -> str:
-    """Return SVG with a score over the frame numbers of each recording, from 10 keys a histogram.
+    """Return SVG with a histogram of a score, and the score over the frames of each recording.
 
     Args:
         axis: The score and its values.
-        dots: The keys, ordered by recording and frame.
+        dots: Keys, ordered by recording and frame.
     """
     ticks, (width_px, height_px) = axis.ticks(), _PLOT_PX
     scale_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / (ticks[-1] - ticks[0])  # per unit of the score
@@ -275,38 +274,34 @@ def score_plot(axis: Axis, dots: Sequence[Dot]) -> str:
         return _PLOT_BASE_PX - (min(max(value, ticks[0]), ticks[-1]) - ticks[0]) * scale_px
 
     parts = [f'<text x="0" y="14" class="title">{html.escape(axis.title)}</text>']
-    values = [dot.value for dot in dots if dot.value is not None]
-    left_px = float(_LABELS_PX)
-    if len(values) >= FEWEST_IN_HISTOGRAM:
-        parts += _draw_histogram(values, (ticks[0], ticks[-1]))
-        left_px += _HISTOGRAM_PX
-    if axis.usual:
-        top, bottom = (height(value) for value in reversed(axis.usual))
-        parts.append(
-            f'<rect x="{left_px}" y="{top:.1f}" width="{width_px - left_px}" '
-            f'height="{bottom - top:.1f}" class="usual"><title>usual on KITTI</title></rect>'
-        )
+    parts += _draw_histograms(axis.values, (ticks[0], ticks[-1]))
+    left_px = float(_LABELS_PX + _HISTOGRAM_PX)
     for tick in ticks:
         parts.append(f'<path d="M{_LABELS_PX} {height(tick):.1f}H{width_px}"/>')
         text = f'<text x="{_LABELS_PX - 4}" y="{height(tick) + 4:.1f}" class="end">'
         parts.append(f"{text}{tick:g}</text>")
-    if axis.limit is not None and ticks[0] <= axis.limit <= ticks[-1]:
-        parts.append(f'<path class="limit" d="M{left_px} {height(axis.limit):.1f}H{width_px}"/>')
+    parts += [
+        f'<path class="limit {style}" d="M{left_px} {height(bound):.1f}H{width_px}"/>'
+        for style, bound in axis.bounds.items()
+        if ticks[0] <= bound <= ticks[-1]
+    ]
     parts += _draw_dots(dots, left_px, height)
     label = html.escape(f"{axis.title} of each key over its frame number")
     size = f"0 0 {width_px} {height_px}"
     return f'<svg viewBox="{size}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
 
 
-def _draw_histogram(values: Sequence[float], ends: tuple[float, float]) -> list[str]:
-    """Return the bars of a histogram, which lie one above the other."""
-    counts = np.histogram(values, _NUM_BINS, ends)[0]
+def _draw_histograms(values: Mapping[str, Sequence[float]], ends: tuple[float, float]) -> list[str]:
+    """Return the bars of histograms over one another, each bar as high as its values."""
+    counts = {style: np.histogram(v, _NUM_BINS, ends)[0] for style, v in values.items()}
+    most = max((int(c.max()) for c in counts.values()), default=0) or 1
     bar_px = (_PLOT_BASE_PX - _PLOT_TOP_PX) / _NUM_BINS
     return [
-        f'<rect x="{_LABELS_PX}" y="{_PLOT_BASE_PX - (row + 1) * bar_px:.1f}" class="bar" '
-        f'height="{bar_px - 1:.1f}" width="{(_HISTOGRAM_PX - 8) * num / counts.max():.1f}">'
-        f"<title>{num:,}</title></rect>"
-        for row, num in enumerate(counts)
+        f'<rect x="{_LABELS_PX}" y="{_PLOT_BASE_PX - (row + 1) * bar_px:.1f}" class="bar {style}" '
+        f'height="{bar_px - 1:.1f}" width="{(_HISTOGRAM_PX - 8) * num / most:.1f}">'
+        f"<title>{num:,} keys</title></rect>"
+        for style, of_style in counts.items()
+        for row, num in enumerate(of_style)
         if num
     ]
 
@@ -326,9 +321,11 @@ def _draw_dots(dots: Sequence[Dot], left_px: float, height: Callable[[float], fl
                 f'<rect class="lane" x="{left_px:.1f}" y="{_PLOT_TOP_PX}" width="{lane_px:.1f}" '
                 f'height="{_PLOT_BASE_PX - _PLOT_TOP_PX}"/>'
             )
+        radius_px = 3.0 if len(dots) <= _MANY_DOTS else 1.5
         for dot in group:
             x = left_px + margin_px + (dot.frame - first) * frame_px
-            parts.append(_draw_dot(dot, x, None if dot.value is None else height(dot.value)))
+            y = None if dot.value is None else height(dot.value)
+            parts.append(_draw_dot(dot, x, y, radius_px))
         if lane_px >= _LEAST_LABEL_PX:
             parts.append(f'<text x="{left_px + margin_px:.1f}" y="154">frame {first}</text>')
             end_px = left_px + lane_px - margin_px
@@ -337,11 +334,14 @@ def _draw_dots(dots: Sequence[Dot], left_px: float, height: Callable[[float], fl
     return parts
 
 
-def _draw_dot(dot: Dot, x: float, y: float | None) -> str:
+def _draw_dot(dot: Dot, x: float, y: float | None, radius_px: float) -> str:
+    style = html.escape(dot.style)
     if y is None:
         shape = f'<path class="failed" d="M{x - 3:.1f} {_PLOT_BASE_PX + 1}l6 6m0 -6l-6 6"/>'
+    elif "above" in dot.style:  # the plot ends below the value
+        shape = f'<path class="{style}" d="M{x - 4:.1f} {_PLOT_TOP_PX + 7}h8l-4 -7z"/>'
     else:
-        shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3" class="{html.escape(dot.style)}"/>'
+        shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius_px}" class="{style}"/>'
     mark = f"<g>{shape}<title>{html.escape(dot.text)}</title></g>"
     return f'<a href="#{html.escape(dot.target)}">{mark}</a>' if dot.target else mark
 
