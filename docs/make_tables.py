@@ -127,8 +127,9 @@ def many_keys(held_out: Any) -> str:
                 text = f"{100 * cell['outliers']:.2f} ± {100 * cell['error']:.2f}"
                 is_known = cell["num_compared"] >= LEAST_PIXELS
                 texts.append(f"{text} ({cell['coverage']:.2f})" if is_known else "–")
-            rows.append([title, *texts])
-    return table(["outliers in % (coverage)", *HELD_OUT], rows)
+            num_true = cells[-1]["num_compared"] / cells[-1]["coverage"]
+            rows.append([title, f"{num_true:,.0f}", *texts])
+    return table(["outliers in % (coverage)", "true pixels", *HELD_OUT], rows)
 
 
 def judged(errors: Any, stored: gate.Stored) -> str:
