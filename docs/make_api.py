@@ -27,6 +27,8 @@ API: Mapping[str, Mapping[str, str]] = {
         "densify.Result": "",
         "densify.Cloud": "displaced select columns to_numpy",
         "densify.DepthMap": "to_points",
+        "densify.geometry.types.ObjectTrack": "",
+        "densify.geometry.types.CameraView": "",
         "densify.FlowField": "total",
     },
     "Recordings": {
@@ -41,6 +43,7 @@ API: Mapping[str, Mapping[str, str]] = {
         "densify.DepthDataset": "",
         "densify.Recipe": "",
         "densify.Gate": "",
+        "densify.dataset.make.Summary": "count num_left mean",
     },
     "Settings and errors": {
         "densify.config.resolve": "",

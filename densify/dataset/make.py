@@ -73,8 +73,7 @@ Shard = tuple[int, int]
 class Summary:
     """The progress of a training set, or of one shard."""
 
-    # Records of the key sweeps tried so far, by drive and frame number
-    records: Mapping[Key, KeyRecord]
+    records: Mapping[Key, KeyRecord]  # of the key sweeps tried so far, by drive and frame number
     num_keys: int  # number of wanted key sweeps
     num_made: int = 0  # number of key sweeps made in this run
     seconds: float = 0.0  # duration of this run

@@ -147,7 +147,7 @@ class Reason(IntEnum):
 class CameraView:
     """The viewpoint of a depth map."""
 
-    camera: Camera
+    camera: Camera  # intrinsics and lens
     T_cam_key: Float  # (4,4) pose of the key frame in the camera frame at the time the map shows
     late_s: float  # time the map shows minus the key's reference time, seconds
     number: int | None  # number of the image; None if the map shows no image
@@ -245,19 +245,29 @@ class ObjectTrack:
 
     Its origin is the middle of the box, x along the motion at the key's time, z that of the key
     frame.
+
+    Attributes:
+        instance: Number of the object, as in `Cloud`.
+        size_m: (3,) length, width and height of the box. It stands on the ground, and is completed
+            to the usual size of a vehicle where no ray passed.
+        frames: Frame numbers of the n sweeps, ascending.
+        stamp_ns: (n,) reference times.
+        T_key_object: (n,4,4) poses in the key frame, ego-motion removed.
+        velocity_m_s: (n,3) velocity of the middle of the box, key frame, ego-motion removed.
+        num_points: (n,) number of points of the object in each sweep.
+        seen_size_m: (3,) length, width and height of the box around its observed points.
+        sides_seen: Sides of the box that were observed: of ``front``, ``rear``, ``left``,
+            ``right`` and ``top``.
     """
 
-    instance: int  # number of the object, as in `Cloud`
-    # (3,) length, width and height of the box. It stands on the ground, and is completed to the
-    # usual size of a vehicle where no ray passed.
+    instance: int
     size_m: Float
-    frames: tuple[int, ...]  # frame numbers of the n sweeps, ascending
-    stamp_ns: Int  # (n,) reference times
-    T_key_object: Float  # (n,4,4) poses in the key frame, ego-motion removed
-    velocity_m_s: Float  # (n,3) velocity of the middle of the box, key frame, ego-motion removed
-    num_points: Int  # (n,) number of points of the object in each sweep
-    seen_size_m: Float  # (3,) length, width and height of the box around its observed points
-    # Sides of the box that were observed, from "front", "rear", "left", "right" and "top"
+    frames: tuple[int, ...]
+    stamp_ns: Int
+    T_key_object: Float
+    velocity_m_s: Float
+    num_points: Int
+    seen_size_m: Float
     sides_seen: tuple[str, ...] = ()
 
 
