@@ -176,7 +176,11 @@ class Folder(FileSequence):
         used = {str(Path(config.files)) for config in self._config.cameras.values()}
         for name, images in files_below(self.where, _IMAGE_SUFFIXES, _SEARCH_DEPTH).items():
             if name not in used:
-                text = f"{name} holds {len(images)} images without a calibration"
+                text = (
+                    f"{name} holds {len(images)} images without a calibration; give in "
+                    f"densify.yaml: cameras: {{{Path(name).name}: {{files: {name}, size: "
+                    f"[width, height], K: [fx, fy, cx, cy], T_cam_lidar: three rows}}}}"
+                )
                 lines.append(("no camera", text))
         return lines
 
