@@ -161,3 +161,10 @@ def test_the_curves_of_a_result_are_of_all_cameras_and_methods(tmp_path) -> None
     assert (tmp_path / "curve.png").read_bytes() == picture
     plots.write_curve(none, tmp_path / "nothing held out")
     assert not (tmp_path / "nothing held out").exists()
+
+
+@pytest.mark.parametrize("ends", [(0.0, 0.0), (0.3, 0.3), (0.0, 0.97), (34.2, 59.9), (0.0, 126.0)])
+def test_the_ticks_of_a_score_are_round_and_enclose_its_values(ends: tuple[float, float]):
+    ticks = plots.Axis("score", *ends, {}, {}).ticks()
+    assert ticks[0] <= ends[0] + 1e-6 and ticks[-1] >= ends[1] - 1e-6 and 2 <= len(ticks) <= 6
+    assert np.allclose(np.diff(ticks), ticks[1] - ticks[0])

@@ -252,11 +252,14 @@ class Axis(NamedTuple):
 
     def ticks(self) -> list[float]:
         """Return round values that enclose the shown ones."""
-        room = max(self.highest - self.lowest, 1e-9) / _NUM_TICKS
+        span = self.highest - self.lowest
+        span = span if span > 1e-6 else 1.0  # equal values
+        room = span / _NUM_TICKS
         power = 10.0 ** np.floor(np.log10(room))
         step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= 0.999 * room)
-        first, last = np.floor(self.lowest / step + 1e-6), np.ceil(self.highest / step - 1e-6)
-        return [float(round(step * row, 9)) for row in np.arange(first, max(last, first + 1) + 1)]
+        first = np.floor(self.lowest / step + 1e-6)
+        last = np.ceil((self.lowest + span) / step - 1e-6)
+        return [float(round(step * row, 9)) for row in np.arange(first, last + 1)]
 
 
 def score_plot(axis: Axis, dots: Sequence[Dot]) -> str:
