@@ -83,13 +83,20 @@ def answer_doctor(options: argparse.Namespace) -> Iterator[Answer]:
         "worst": str(diagnosis.worst),
         "findings": [{**asdict(f), "verdict": str(f.verdict)} for f in diagnosis.findings],
     }
-    files = []
+    files, note = [], ""
     if options.write is not None:
         changes = [text for f in diagnosis.findings for text in _SETTING.findall(f.remedy)]
         settings = find_changes(resolve(config, changes))
         write_file(options.write, yaml.safe_dump(settings, sort_keys=False).encode())
         files = [options.write]
-    yield Answer(f"{describe(sequence)}\n\n{_verdicts(diagnosis)}", facts, files)
+        num_other = sum(
+            bool(f.remedy) and not _SETTING.search(f.remedy) for f in diagnosis.findings
+        )
+        if num_other:
+            note = (
+                f"\n{num_other} of the remedies above are no settings, and not in {options.write}"
+            )
+    yield Answer(f"{describe(sequence)}\n\n{_verdicts(diagnosis)}{note}", facts, files)
     wrong = [f.check for f in diagnosis.findings if f.verdict == Verdict.WRONG]
     if wrong:
         raise InputError(f"{spec}: wrong: {', '.join(wrong)}; the remedies are above")

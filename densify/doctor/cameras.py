@@ -46,6 +46,11 @@ _DIRECTIONS = (
 def check_cameras(sample: Sample) -> list[Finding]:
     """Check the images, the calibration and the clock of every camera."""
     if not sample.sequence.cameras:
+        lines = sample.sequence.findings() if hasattr(sample.sequence, "findings") else ()
+        for name, text in lines:
+            if name == "no camera":  # images, but no calibration
+                found, _, remedy = text.partition("; ")
+                return [Finding("cameras", SUSPICIOUS, f"none: {found}", remedy)]
         return [Finding("cameras", FINE, "none: the cloud and the scores alone")]
     findings = []
     silhouettes: dict[int, Silhouettes] = {}  # frame -> silhouettes, shared by the cameras
