@@ -476,7 +476,8 @@ def _card(made: JudgedSet, record: KeyRecord, width_px: int = _WIDTH_PX) -> str:
         if value is not None:
             text = f"{series.score.title.lower()} {series.score.text(value)} {series.score.unit}"
             is_suspect = any(judgement.series == series for judgement in suspect)
-            texts.append(_marked(html.escape(text).replace(" ", "&nbsp;"), is_suspect))
+            unbroken = html.escape(text).replace(" ", "&nbsp;").replace("-", "&#8209;")
+            texts.append(_marked(unbroken, is_suspect))
     remarks = "; ".join(filter(None, [why, record.reason, *record.warnings]))
     files = ", ".join(
         f'<a href="{quote(path)}">{kind}</a>'
