@@ -95,7 +95,16 @@ class Judgement(NamedTuple):
         text = f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}"
         if score.is_error:
             return f"{text}, usual up to {score.text(self.bound)} {score.unit}"
-        return f"{text}, median {score.text(self.median)} {score.unit}"
+        return self.comparison(with_camera)
+
+    def comparison(self, with_camera: bool) -> str:
+        """Return the value beside the median of the set as text."""
+        score = self.series.score
+        camera = f" of {self.series.camera}" if with_camera and self.series.camera else ""
+        return (
+            f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}, median "
+            f"{score.text(self.median)} {score.unit}"
+        )
 
 
 class Limit(NamedTuple):

@@ -68,6 +68,7 @@ _NUM_LISTED = 1000  # rows of the table of keys, the worst first
 _NUM_DOTS = 1000  # of a plot, half of them the worst keys
 _NUM_NAMED = 4  # suspect keys that the verdict names
 _NUM_MESSAGES = 20  # rows of the table of reasons and warnings
+_ON_CARDS = ("ghost", "outliers", "outliers_moving", "density", "density_filled")
 _FEWEST_IN_RANGE = 20  # keys; fewer have no share of 5 to 95 %
 _MANY_ASIDE = 0.1  # a greater share of keys put aside or failed is reported in the verdict
 # Gray of confidence from 0.2, 10 % expected outliers, to 0.8, 0.01 %
@@ -226,11 +227,13 @@ def _suspect_sentence(made: JudgedSet, targets: Mapping[Key, str]) -> str:
     links = [_suspect_link(made, name, targets) for name in ordered[:_NUM_NAMED]]
     num_more = len(ordered) - len(links)
     links += [f"and {num_more:,} more"] if num_more else []
-    causes = Counter(_title(made, made.suspects[name][0].series).lower() for name in ordered)
+    found = [_title(made, j.series).lower() for name in ordered for j in made.suspects[name]]
+    causes = Counter(found)
     by = ", ".join(f"{html.escape(title)} {num:,}" for title, num in causes.most_common())
     verb = "is" if len(ordered) == 1 else "are"
     count = f"{len(ordered):,} of {len(made.worst_first):,} keys {verb} suspect"
-    return f"{count} (by {by}): {', '.join(links)}."
+    drop = "<code>--set dataset.suspects=aside</code> drops them."
+    return f"{count} (by {by}): {', '.join(links)}. {drop}"
 
 
 def _suspect_link(made: JudgedSet, name: Key, targets: Mapping[Key, str]) -> str:
@@ -254,7 +257,12 @@ def _error_sentence(made: JudgedSet) -> str:
         for name in ("outliers", "expected_outliers")
     }
     if medians["outliers"]:
-        return f"Outliers of the median key, held out: {', '.join(medians['outliers'])}."
+        moving = next(score for score in SCORES if score.name == "outliers_moving")
+        values = [made.worst_value(moving, record)[0] for record in made.worst_first]
+        known = [value for value in values if value is not None]
+        judged = f"Moving pixels are judged in {len(known):,} of {len(values):,} keys"
+        judged += f": {moving.text(float(np.median(known)))} %." if known else ", too few to tell."
+        return f"Outliers of the median key, held out: {', '.join(medians['outliers'])}. {judged}"
     expected = ", ".join(medians["expected_outliers"])
     expected = f" By confidence, {expected} are expected." if expected else ""
     return (
@@ -399,7 +407,8 @@ def _plot(made: JudgedSet, score: Score, rows: Mapping[Key, str]) -> str:
                     "above": value > axis.ticks()[-1],
                 }
                 style = " ".join([style, *(mark for mark, is_on in marks.items() if is_on)])
-                text = f"{name} {series.camera}: {score.text(value)} {score.unit}"
+                of_camera = f"{name}, {series.camera}" if series.camera else name
+                text = f"{of_camera}: {score.text(value)} {score.unit}"
                 dots.append(Dot(record.drive, record.key, value, style, text, target))
     return score_plot(axis, dots)
 
@@ -456,8 +465,9 @@ def _small_card(
     name = html.escape(made.name_of(record))
     target = cards.get(record.name) or rows.get(record.name, "")
     style = ' class="suspect"' if record.name in made.suspects else ""
+    label = f"{record.key} {html.escape(camera)}" if len(made.cameras) > 1 else f"{record.key}"
     link = f' href="#{target}"' if target else ""
-    return f'<a{link}{style} title="{name}">{picture}{record.key}</a>'
+    return f'<a{link}{style} title="{name}">{picture}{label}</a>'
 
 
 def _card(made: JudgedSet, record: KeyRecord, width_px: int = _WIDTH_PX) -> str:
@@ -473,22 +483,24 @@ def _card(made: JudgedSet, record: KeyRecord, width_px: int = _WIDTH_PX) -> str:
     texts = []
     for series in made.series:
         value = series.of(record) if series.camera in ("", camera) else None
-        if value is not None:
+        if value is not None and series.score.name in _ON_CARDS:
             text = f"{series.score.title.lower()} {series.score.text(value)} {series.score.unit}"
             is_suspect = any(judgement.series == series for judgement in suspect)
             unbroken = html.escape(text).replace(" ", "&nbsp;").replace("-", "&#8209;")
             texts.append(_marked(unbroken, is_suspect))
+    worst = made.worst.get(record.name)
+    if worst is not None and not suspect:
+        why = f"its worst score: {worst.comparison(len(made.cameras) > 1)}"
     remarks = "; ".join(filter(None, [why, record.reason, *record.warnings]))
     files = ", ".join(
         f'<a href="{quote(path)}">{kind}</a>'
         for kind, kinds in (
             ("measured", _MEASURED),
             ("filled", FILLED),
-            ("confidence", ("confidence",)),
         )
         if (path := find_map(record, kinds, camera))
     )
-    files = f"{'<br>' if remarks else ''}Files (PNG of 16 bits): {files}" if files else ""
+    files = f"{'<br>' if remarks else ''}Depth, 256 × metres: {files}" if files else ""
     return (
         f'<figure id="{_anchor("card", record)}"><figcaption>'
         f"{_link(name, _own_page(record))}, {html.escape(camera)}<br>{', '.join(texts)}"

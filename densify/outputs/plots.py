@@ -302,7 +302,7 @@ def _draw_histograms(values: Mapping[str, Sequence[float]], ends: tuple[float, f
     return [
         f'<rect x="{_LABELS_PX}" y="{_PLOT_BASE_PX - (row + 1) * bar_px:.1f}" class="bar {style}" '
         f'height="{bar_px - 1:.1f}" width="{(_HISTOGRAM_PX - 8) * num / most:.1f}">'
-        f"<title>{num:,} keys</title></rect>"
+        f"<title>{num:,}</title></rect>"
         for style, of_style in counts.items()
         for row, num in enumerate(of_style)
         if num
