@@ -333,7 +333,7 @@ def make_set(runs: Path, pandaset: Path | None) -> None:
     if densify(["report", str(folder), "--overwrite"]):
         raise SystemExit("densify report failed; its message is above")
     command = [browser, "--headless", "--no-sandbox", "--hide-scrollbars"]
-    command += [f"--screenshot={screenshot}", "--window-size=1200,1125"]
+    command += [f"--screenshot={screenshot}", "--window-size=1200,1330"]
     subprocess.run([*command, (folder / "report.html").as_uri()], check=True)
     write("set", np.asarray(Image.open(screenshot).convert("RGB")))
 

@@ -313,7 +313,9 @@ def commands() -> str:
     shared = {row for row, count in uses.items() if count >= 5}
     first_uses = [row for row in uses if row in shared]
     rows = sorted(first_uses, key=lambda row: ("-" in row[0][:1], row[0].startswith("--json")))
-    blocks = ["## Common options", table(["option", "meaning"], coded(rows))]
+    overview = [[f"[`{p.prog}`](#{p.prog.replace(' ', '-')})", summary(p)] for p in parsers]
+    blocks = [table(["command", "to"], overview)]
+    blocks += ["## Common options", table(["option", "meaning"], coded(rows))]
     for parser in parsers:
         own = [row for row in options_of(parser) if row not in shared]
         common = [
@@ -326,6 +328,12 @@ def commands() -> str:
         blocks += [f"[Common options](#common-options): {', '.join(common)}."]
         blocks += [plain(parser.epilog)] if parser.epilog else []
     return "\n" + "\n\n".join(blocks) + "\n"
+
+
+def summary(parser: argparse.ArgumentParser) -> str:
+    """Return the first clause of a command's description."""
+    first = re.split(r"[.:;](?:\s|$)", plain(parser.description))[0]
+    return first[:1].lower() + first[1:]
 
 
 def commands_of(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

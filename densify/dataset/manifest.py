@@ -166,7 +166,7 @@ def describe_cost(records: Iterable[KeyRecord]) -> str:
     seconds = sum(record.seconds for record in records)
     num_bytes = sum(file.num_bytes for record in records for file in record.files.values())
     disk = f", {_size(num_bytes)}" if num_bytes else ""
-    return f"{_duration(seconds, seconds)} in all{disk}" if records else ""
+    return f"{_duration(seconds, seconds)} of computing{disk}" if records else ""
 
 
 def describe_rest(records: Iterable[KeyRecord], num_left: int) -> str:

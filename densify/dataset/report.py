@@ -215,9 +215,15 @@ def _verdict(made: JudgedSet, targets: Mapping[Key, str]) -> tuple[str, str]:
     if made.suspects:
         lines.append(_suspect_sentence(made, targets))
     lines.append(_error_sentence(made))
-    if num_all - num_done > _MANY_ASIDE * num_all:
-        level = "look" if level == "good" else level
-        lines.append(f"{num_all - num_done:,} of {num_all:,} keys were put aside or failed.")
+    if num_all - num_done > _MANY_ASIDE * num_all and level == "good":
+        level = "look"
+    counts = Counter[str](record.status for record in made.records)
+    if num_all > num_done:
+        texts = [f"{counts['failed']:,} failed"] if counts["failed"] else []
+        texts += [f"{counts['aside']:,} were put aside"] if counts["aside"] else []
+        lines.append(f'{" and ".join(texts)} (<a href="#left-out">why</a>).')
+    if num_warned := sum(bool(record.warnings) for record in made.worst_first):
+        lines.append(f'<a href="#reasons">Warnings</a>: {num_warned:,} keys.')
     return level, " ".join(lines)
 
 
@@ -232,6 +238,7 @@ def _suspect_sentence(made: JudgedSet, targets: Mapping[Key, str]) -> str:
     by = ", ".join(f"{html.escape(title)} {num:,}" for title, num in causes.most_common())
     verb = "is" if len(ordered) == 1 else "are"
     count = f"{len(ordered):,} of {len(made.worst_first):,} keys {verb} suspect"
+    by += "; some by several" if len(found) > len(ordered) else ""
     drop = "<code>--set dataset.suspects=aside</code> drops them."
     return f"{count} (by {by}): {', '.join(links)}. {drop}"
 
@@ -261,7 +268,9 @@ def _error_sentence(made: JudgedSet) -> str:
         values = [made.worst_value(moving, record)[0] for record in made.worst_first]
         known = [value for value in values if value is not None]
         judged = f"Moving pixels are judged in {len(known):,} of {len(values):,} keys"
-        judged += f": {moving.text(float(np.median(known)))} %." if known else ", too few to tell."
+        judged += f": {moving.text(float(np.median(known)))} %." if known else ": look at them."
+        if not any(moving.name in record.scores for record in made.worst_first):
+            judged = ""  # made by an earlier version
         return f"Outliers of the median key, held out: {', '.join(medians['outliers'])}. {judged}"
     expected = ", ".join(medians["expected_outliers"])
     expected = f" By confidence, {expected} are expected." if expected else ""
@@ -438,7 +447,7 @@ def _legend(made: JudgedSet) -> str:
         "Red: suspect.": bool(made.suspects),
         "Hollow: put aside.": "aside" in statuses,
         "Cross: failed.": "failed" in statuses,
-        "Triangle: beyond the plot, such as the first key, which waits for compilation.": (
+        "Triangle: beyond the plot, as of keys that wait for compilation or registration.": (
             max(seconds) > 3 * float(np.median(seconds))
         ),
     }
