@@ -185,7 +185,8 @@ def training(networks: Any) -> str:
 
 def trained(networks: Any) -> str:
     """Return the table of the README: networks of all real recordings on the two real tests."""
-    kinds = ("rigid (ICP)", "rigid cleaned", "densify measured", "densify filled")
+    kinds = ("single sweep held out", "rigid (ICP)", "rigid cleaned")
+    kinds += ("densify measured", "densify filled")
     real = [test for test in next(iter(networks["both"].values())) if "street" not in test]
     of_kinds = {k: {t: networks["both"][k][t] for t in real} for k in kinds}
     rows = [[kind, *cells] for kind, cells in zip(of_kinds, best_in_bold(of_kinds), strict=True)]
@@ -196,7 +197,8 @@ def trained(networks: Any) -> str:
 def gains(networks: Any) -> str:
     """Return by how much fewer the outliers after training on densify's measured maps are."""
     of_kinds, rows = networks["both"], []
-    for kind in ("rigid (ICP)", "rigid cleaned"):
+    simpler = ("single sweep held out", "single sweep IP-Basic", "rigid (ICP)", "rigid cleaned")
+    for kind in simpler:
         cells = []
         for test, parts in of_kinds[kind].items():
             for part, (others, _) in parts.items():

@@ -189,7 +189,10 @@ def _state(made: JudgedSet, command: str) -> str:
 
 
 def _verdict(made: JudgedSet, targets: Mapping[Key, str]) -> tuple[str, str]:
-    """Return ``good``, ``look`` or ``bad``, and sentences as HTML that say why and what to do."""
+    """Return a level (good, plain, look, bad), and sentences as HTML: why, and what to do.
+
+    A set without suspect keys is ``plain`` where no moving pixel was judged.
+    """
     if not made.worst_first:
         return "bad", "✗ Stop: no key is done. The reasons are below."
     num_done, num_all = len(made.worst_first), len(made.records)
@@ -210,12 +213,13 @@ def _verdict(made: JudgedSet, targets: Mapping[Key, str]) -> tuple[str, str]:
         level = "look"
         lines.append("! Usable, but look at the suspect keys before you train on them.")
     else:
-        level = "good"
-        lines.append(f"✓ Good: no key of {num_done:,} is suspect.")
+        is_judged = any(s.score.name == "outliers_moving" for s in made.series)
+        level, mark = ("good", "✓ Good") if is_judged else ("plain", "✓ Good on static surfaces")
+        lines.append(f"{mark}: no key of {num_done:,} is suspect.")
     if made.suspects:
         lines.append(_suspect_sentence(made, targets))
     lines.append(_error_sentence(made))
-    if num_all - num_done > _MANY_ASIDE * num_all and level == "good":
+    if num_all - num_done > _MANY_ASIDE * num_all and level in ("good", "plain"):
         level = "look"
     counts = Counter[str](record.status for record in made.records)
     if num_all > num_done:
