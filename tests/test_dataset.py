@@ -6,6 +6,7 @@ from __future__ import annotations
 import html
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -97,6 +98,21 @@ def test_a_preview_is_a_part_of_the_set(border_drive: Path, tmp_path: Path, caps
     assert exit_code(*arguments) == 0
     page = (out / "report.html").read_text()
     assert "9 done" in page and "Preview" not in page
+
+
+def test_a_later_limit_of_outliers_scores_finished_keys_once(
+    border_drive: Path, tmp_path: Path, capsys
+) -> None:
+    arguments = ("dataset", "--data", border_drive, *OPTIONS, "--keys", "39:41", "--out", tmp_path)
+    limit, none = ("--set", "dataset.max_outliers=0.9"), ("--method", "none")
+    for method in (("--method", "icp"), none):  # nothing of a single sweep can be held out
+        out = tmp_path / method[1]
+        made = []
+        for options in ((), limit, limit):
+            assert exit_code(*arguments[:-1], out, *method, *options) == 0
+            made.append(re.findall(r"; (\d+) now", capsys.readouterr().out))
+        assert made == [["2"], ["2"], []], method
+        assert [bool(r["scores"]["outliers"]) for r in records(out)] == [method != none] * 2
 
 
 def test_a_preview_measures_outliers(border_drive: Path, tmp_path: Path) -> None:

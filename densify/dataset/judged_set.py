@@ -21,7 +21,7 @@ from densify.dataset.manifest import USUAL_SHARES, Key, KeyRecord, read_manifest
 from densify.dataset.plan import Drive, drives_of, read_plan
 
 _FENCE, _END = 2.698, 1.645  # standard deviations, to a fence and to an end of 5 to 95 %
-_SHARES_LOST = (0.0, 0.05, 0.1)  # of the keys, by the limits whose cost is told; at least one key
+_SHARES_LOST = (0.0, 0.05, 0.1)  # shares of the keys that limits put aside; 0 is a single key
 _NUMBER = re.compile(r"\d+(?:[.,:/-]\d+)*")
 
 
@@ -39,6 +39,22 @@ class Score(NamedTuple):
     def text(self, value: float | None) -> str:
         """Return a value without its unit, "" if unknown."""
         return "" if value is None else f"{value:.{self.num_digits}f}"
+
+    def by_camera(self, record: KeyRecord) -> dict[str, float]:
+        """Return camera -> the known score of a key in ``unit``, of the camera's worst image.
+
+        The camera of a score without cameras is "".
+        """
+        if self.name == "seconds":
+            return {"": record.seconds}
+        value = record.scores.get(self.name)
+        worst: dict[str, float] = {}
+        for name, share in (value if isinstance(value, Mapping) else {"": value}).items():
+            if share is not None:
+                camera, percent = name.partition("/")[0], 100 * share
+                both = worst.get(camera, percent), percent
+                worst[camera] = max(both) if self.is_bad > 0 else min(both)
+        return worst
 
     def usual(self) -> list[float]:
         """Return the ends of the range on KITTI in ``unit``, [] if unknown."""
@@ -66,16 +82,7 @@ class Series(NamedTuple):
 
     def of(self, record: KeyRecord) -> float | None:
         """Return the score of a key in the score's unit, of the worst image; None if unknown."""
-        if self.score.name == "seconds":
-            return record.seconds
-        value = record.scores.get(self.score.name)
-        values = value if isinstance(value, Mapping) else {"": value}
-        known = [
-            100 * share
-            for name, share in values.items()
-            if share is not None and name.partition("/")[0] == self.camera
-        ]
-        return max(known, key=lambda percent: self.score.is_bad * percent, default=None)
+        return self.score.by_camera(record).get(self.camera)
 
 
 class Judgement(NamedTuple):
@@ -90,21 +97,19 @@ class Judgement(NamedTuple):
 
     def reason(self, with_camera: bool) -> str:
         """Return why the key is suspect as text, with the name of the camera if asked for."""
-        score = self.series.score
-        camera = f" of {self.series.camera}" if with_camera and self.series.camera else ""
-        text = f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}"
-        if score.is_error:
-            return f"{text}, usual up to {score.text(self.bound)} {score.unit}"
-        return self.comparison(with_camera)
+        if not self.series.score.is_error:
+            return self.comparison(with_camera)
+        return self._beside("usual up to", self.bound, with_camera)
 
     def comparison(self, with_camera: bool) -> str:
         """Return the value beside the median of the set as text."""
+        return self._beside("median", self.median, with_camera)
+
+    def _beside(self, title: str, other: float, with_camera: bool) -> str:
         score = self.series.score
         camera = f" of {self.series.camera}" if with_camera and self.series.camera else ""
-        return (
-            f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}, median "
-            f"{score.text(self.median)} {score.unit}"
-        )
+        value = f"{score.title.lower()}{camera} {score.text(self.value)} {score.unit}"
+        return f"{value}, {title} {score.text(other)} {score.unit}"
 
 
 class Limit(NamedTuple):
@@ -122,7 +127,7 @@ class JudgedSet(NamedTuple):
     drives: Mapping[str, Drive]
     records: Sequence[KeyRecord]  # ordered by recording and frame
     worst_first: Sequence[KeyRecord]  # the keys that are done
-    worst: Mapping[Key, Judgement]  # the worst score of each key that is done
+    worst: Mapping[Key, Judgement]  # the worst score of each key that is made
     suspects: Mapping[Key, Sequence[Judgement]]  # suspect scores of the suspect keys that are done
     series: Sequence[Series]  # the scores that a key of the set has, by camera
     bounds: Mapping[Series, float]  # value beyond which a key is suspect
@@ -147,8 +152,7 @@ class JudgedSet(NamedTuple):
 
     def worst_value(self, score: Score, record: KeyRecord) -> tuple[float | None, str]:
         """Return a score of the key's worst camera, None if unknown, and the camera of several."""
-        values = {s.camera: s.of(record) for s in self.series if s.score is score}
-        known = {camera: value for camera, value in values.items() if value is not None}
+        known = score.by_camera(record)
         if not known:
             return None, ""
         camera = max(known, key=lambda name: score.is_bad * known[name])
@@ -177,11 +181,16 @@ def suspects_of(records: Sequence[KeyRecord]) -> dict[Key, list[Judgement]]:
 
     Keys that were put aside count too: the others are judged as before.
     """
-    suspects = {
-        name: [j for j in sorted(judgements, key=_badness, reverse=True) if j.is_suspect]
-        for name, judgements in _judge_all(records).items()
+    return _suspects(_judge_all(records))
+
+
+def _suspects(judgements: Mapping[Key, Sequence[Judgement]]) -> dict[Key, list[Judgement]]:
+    """Return the suspect scores, the worst first, of the keys that have some."""
+    ordered = {
+        name: [j for j in sorted(of_key, key=_badness, reverse=True) if j.is_suspect]
+        for name, of_key in judgements.items()
     }
-    return {name: found for name, found in suspects.items() if found}
+    return {name: found for name, found in ordered.items() if found}
 
 
 def read_judged(root: Path) -> JudgedSet:
@@ -208,7 +217,7 @@ def read_judged(root: Path) -> JudgedSet:
         records,
         sorted(done, key=badness, reverse=True),
         worst,
-        {name: found for name, found in suspects_of(records).items() if name in kept},
+        {name: found for name, found in _suspects(all_judgements).items() if name in kept},
         series,
         bounds,
     )
@@ -217,13 +226,7 @@ def read_judged(root: Path) -> JudgedSet:
 def _series_of(record: KeyRecord) -> Iterable[Series]:
     """Return the scores that a key has, by camera."""
     for score in SCORES:
-        value = record.seconds if score.name == "seconds" else record.scores.get(score.name)
-        values = value if isinstance(value, Mapping) else {"": value}
-        yield from (
-            Series(score, name.partition("/")[0])
-            for name, share in values.items()
-            if share is not None
-        )
+        yield from (Series(score, camera) for camera in score.by_camera(record))
 
 
 def _judge_all(records: Sequence[KeyRecord]) -> dict[Key, list[Judgement]]:

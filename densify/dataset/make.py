@@ -234,7 +234,7 @@ def _finished(
     if gate is None:
         return records
     if gate.max_outliers is not None:  # keys that were not scored cannot be judged
-        records = {name: r for name, r in records.items() if r.scores.get("outliers")}
+        records = {name: r for name, r in records.items() if r.scores.get("is_scored")}
     beyond = beyond_limits(records, gate)
     return {name: r for name, r in records.items() if r.status == "done" or name in beyond}
 
@@ -412,7 +412,7 @@ def _densified(job: Job, key: int) -> KeyRecord:
     results = pipeline.densify(recording, key, methods, cameras, with_images=not is_tree)
     cache.trim()
     result = results[recipe.method]
-    scores = _scores(result.metrics)
+    scores = _scores(result.metrics) | {"is_scored": recording.settings.is_scored}
     reason = recipe.gate.reason(scores, len(result.frames))
     if reason is None:
         kept_picture(job.out, job.drive, key).unlink(missing_ok=True)  # put aside before

@@ -273,8 +273,6 @@ def _error_sentence(made: JudgedSet) -> str:
         known = [value for value in values if value is not None]
         judged = f"Moving pixels are judged in {len(known):,} of {len(values):,} keys"
         judged += f": {moving.text(float(np.median(known)))} %." if known else ": look at them."
-        if not any(moving.name in record.scores for record in made.worst_first):
-            judged = ""  # made by an earlier version
         return f"Outliers of the median key, held out: {', '.join(medians['outliers'])}. {judged}"
     expected = ", ".join(medians["expected_outliers"])
     expected = f" By confidence, {expected} are expected." if expected else ""
@@ -404,7 +402,7 @@ def _plot(made: JudgedSet, score: Score, rows: Mapping[Key, str]) -> str:
         highest = min(highest, 3 * float(np.median(known)))
     axis = Axis(f"{score.title}, {score.unit}", lowest, highest, all_values, bounds)
 
-    dots, drawn = [], _drawn(made)
+    dots, drawn, top = [], _drawn(made), axis.ticks()[-1]
     for record in made.records:
         target, name = rows.get(record.name, ""), f"{record.drive}, key {record.key}"
         if record.status == "failed":
@@ -417,7 +415,7 @@ def _plot(made: JudgedSet, score: Score, rows: Mapping[Key, str]) -> str:
                 marks = {
                     "hollow": record.status == "aside",
                     "suspect": any(judgement.series == series for judgement in suspect),
-                    "above": value > axis.ticks()[-1],
+                    "above": value > top,
                 }
                 style = " ".join([style, *(mark for mark, is_on in marks.items() if is_on)])
                 of_camera = f"{name}, {series.camera}" if series.camera else name
@@ -507,10 +505,7 @@ def _card(made: JudgedSet, record: KeyRecord, width_px: int = _WIDTH_PX) -> str:
     remarks = "; ".join(filter(None, [why, record.reason, *record.warnings]))
     files = ", ".join(
         f'<a href="{quote(path)}">{kind}</a>'
-        for kind, kinds in (
-            ("measured", _MEASURED),
-            ("filled", FILLED),
-        )
+        for kind, kinds in (("measured", _MEASURED), ("filled", FILLED))
         if (path := find_map(record, kinds, camera))
     )
     files = f"{'<br>' if remarks else ''}Depth, 256 × metres: {files}" if files else ""

@@ -49,8 +49,8 @@ def check_cameras(sample: Sample) -> list[Finding]:
         lines = sample.sequence.findings() if hasattr(sample.sequence, "findings") else ()
         for name, text in lines:
             if name == "no camera":  # images, but no calibration
-                found, _, remedy = text.partition("; ")
-                return [Finding("cameras", SUSPICIOUS, f"none: {found}", remedy)]
+                remedy = "fill in these lines, or go on without depth maps"
+                return [Finding("cameras", SUSPICIOUS, f"none: {text}", remedy)]
         return [Finding("cameras", FINE, "none: the cloud and the scores alone")]
     findings = []
     silhouettes: dict[int, Silhouettes] = {}  # frame -> silhouettes, shared by the cameras
